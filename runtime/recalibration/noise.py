@@ -1,4 +1,4 @@
-"""Noise of an estimator's phases after each step, measured on known pages."""
+"""Noise of an estimator's phases after each step, and its flat field, measured on known pages."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from lightpage.calibration.calibrate import KnownPage
 from lightpage.calibration.calibrated_device import CalibratedDevice
+from lightpage.calibration.likelihood.flat_field import flat_field
 from lightpage.calibration.likelihood.noise import expected_bits, fitted_noise
 from lightpage.calibration.likelihood.statistics import Statistics
-from lightpage.calibration.likelihood.table import pilot_tensors
+from lightpage.calibration.likelihood.table import FLAT_FIELD, pilot_tensors
 from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.device.profile import Profile
 from lightpage.page.correction import wrapped
@@ -29,7 +30,7 @@ from lightpage.waves.grid import symbol_samples
 MOST_STEPS = 6
 """Largest number of Gauss-Newton steps."""
 _LEAST_GAIN_BITS = 0.004
-"""Least gain of information for another step, and for the estimation of deviations, bits a symbol."""
+"""Least gain of information for another step, for a flat field, and for the estimation of deviations, bits a symbol."""
 
 
 class KnownPhases(NamedTuple):
@@ -70,52 +71,82 @@ def measured_noise(
     prior_scale: float,
     steps: int | None = None,
 ) -> SamplingTable:
-    """Measure the noise of the first estimate and after each step, and the prior of the modulator's deviations.
+    """Measure the noise of the first estimate and after each step, the flat field, and the prior of the deviations.
 
-    Deviations of the modulator's samples are estimated only if known pages are read better with them.
+    Deviations of the modulator's samples are estimated only if known pages are read better with them. There is a flat
+    field only if each known page is read better, on average, with that of the others.
 
     Args:
-        graph: graph of the device, with at least `steps` steps, or `MOST_STEPS` if these are left out.
+        graph: graph of the device without a flat field, with at least `steps` steps, or `MOST_STEPS` if these are left out.
         pages: known pages.
         mask: positions of the pilots, bool [ny, nx].
         prior_scale: see `deviation_prior_scale`.
         steps: number of steps; if left out, as many as gain information.
 
     Returns:
-        `NOISE` [steps + 1, 2] and `DEVIATION_PRECISION` [].
+        `NOISE` [steps + 1, 2], `FLAT_FIELD` [ny, nx] and `DEVIATION_PRECISION` [].
     """
     information = graph.value("information")[~mask].astype(np.float64)
-    fixed_graph = graph.with_table({DEVIATION_PRECISION: NO_DEVIATIONS})
-    fixed, fixed_bits = _noise_by_step(fixed_graph, pages, mask, steps)
-    variance = float(np.mean(fixed[-1, 0] / information + fixed[-1, 1]))
+    fixed = _measured(graph.with_table({DEVIATION_PRECISION: NO_DEVIATIONS}), pages, mask, steps)
+    variance = float(np.mean(fixed.noise[-1, 0] / information + fixed.noise[-1, 1]))
     precision = np.array(1 / (prior_scale * variance), np.float32)
-    fitted, fitted_bits = _noise_by_step(graph.with_table({DEVIATION_PRECISION: precision}), pages, mask, steps)
-    if fitted_bits < fixed_bits + _LEAST_GAIN_BITS:
-        return {NOISE: fixed, DEVIATION_PRECISION: NO_DEVIATIONS}
-    return {NOISE: fitted, DEVIATION_PRECISION: precision}
+    fitted = _measured(graph.with_table({DEVIATION_PRECISION: precision}), pages, mask, steps)
+    if fitted.bits < fixed.bits + _LEAST_GAIN_BITS:
+        fitted = fixed
+        precision = NO_DEVIATIONS
+    return {NOISE: fitted.noise, FLAT_FIELD: fitted.flat_field.astype(np.float32), DEVIATION_PRECISION: precision}
 
 
-def _noise_by_step(
+class _Measured(NamedTuple):
+    """Measurements on known pages.
+
+    Attributes:
+        noise: noise after each step, [steps + 1, 2].
+        flat_field: mean error of the symbols' phases after the last step, radians [ny, nx].
+        bits: expected information after the last step, bits a symbol.
+    """
+
+    noise: NDArray[np.float32]
+    flat_field: NDArray[np.float64]
+    bits: float
+
+
+def _measured(
     graph: EstimatorGraph, pages: Sequence[KnownPhases], mask: NDArray[np.bool_], steps: int | None
-) -> tuple[NDArray[np.float32], float]:
-    """Measure the noise after each step, [steps + 1, 2], and the information after the last one, bits a symbol."""
+) -> _Measured:
+    """Measure noise and flat field.
+
+    An error is reduced by the flat field of the other pages. That is what a graph with this flat field would give, to
+    first order, and needs no further runs.
+    """
     most = MOST_STEPS if steps is None else steps
     noise = np.tile(np.array([1, 0], np.float32), (len(graph.value(NOISE)), 1))
     information = graph.value("information")[~mask].astype(np.float64)
-    bits: list[float] = []
+    everywhere = np.tile(information, len(pages))
+    flat = np.zeros(mask.shape)
+    bits = 0.0
     for number in range(most + 1):
         graph = graph.with_table({NOISE: noise})
-        errors = [_errors(graph, page, mask, number) for page in pages]
-        noise[number] = fitted_noise(np.concatenate(errors), np.tile(information, len(pages)))
-        bits.append(expected_bits(noise[number], information))
-        if steps is None and number > 1 and bits[-1] < bits[-2] + _LEAST_GAIN_BITS:
-            return noise[:number], bits[-2]
-    return noise[: most + 1], bits[-1]
+        errors = np.stack([_errors(graph, page, mask, number) for page in pages])
+        repeated = flat_field(errors)
+        row = fitted_noise(errors[:, ~mask].ravel(), everywhere)
+        reached = expected_bits(row, information)
+        corrected_row = fitted_noise((errors - repeated.by_others)[:, ~mask].ravel(), everywhere)
+        helps = expected_bits(corrected_row, information) >= reached + _LEAST_GAIN_BITS
+        if helps:
+            row = corrected_row
+            reached = expected_bits(row, information)
+        if steps is None and number > 1 and reached < bits + _LEAST_GAIN_BITS:
+            return _Measured(noise[:number], flat, bits)
+        noise[number] = row
+        flat = repeated.phases if helps else np.zeros_like(repeated.phases)
+        bits = reached
+    return _Measured(noise[: most + 1], flat, bits)
 
 
 def _errors(graph: EstimatorGraph, page: KnownPhases, mask: NDArray[np.bool_], steps: int) -> NDArray[np.float64]:
-    """Errors of the data symbols' phases after so many steps, radians, 1-D."""
+    """Errors of the symbols' phases after so many steps, radians [ny, nx]."""
     (p,) = graph.run(["p"], page.feeds(mask), steps)
     error = wrapped(np.arctan2(p[1], p[0]).astype(np.float64) - page.phases)
     piston = np.angle(np.mean(np.exp(1j * error[mask])))
-    return np.asarray(wrapped(error - piston)[~mask])
+    return np.asarray(wrapped(error - piston))

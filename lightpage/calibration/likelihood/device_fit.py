@@ -14,11 +14,21 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.calibration.calibrate import KnownPage, Registered, goodness_of
+from lightpage.calibration.calibrate import KnownPage, Registered
 from lightpage.calibration.calibrated_device import CalibratedDevice
+from lightpage.calibration.goodness.measure import measure_goodness
+from lightpage.calibration.goodness.verdict import Goodness
 from lightpage.calibration.interfaces import Twin
 from lightpage.calibration.likelihood.interfaces import Derivatives, PageLikelihood, ProgressCallback
-from lightpage.calibration.likelihood.known_page_fit import NUISANCES, SHIFT, KnownPageFit, nuisance_precision
+from lightpage.calibration.likelihood.known_page_fit import (
+    GAIN,
+    NUISANCES,
+    SHIFT,
+    FittedPage,
+    KnownPageFit,
+    moved_nuisance,
+    nuisance_precision,
+)
 from lightpage.calibration.likelihood.measure import light_table
 from lightpage.calibration.likelihood.statistics import Statistics
 from lightpage.calibration.likelihood.table import count_tensors
@@ -120,7 +130,8 @@ class DeviceFit:
             moved, moved_conditions = _moved(
                 current, abs(fit.pages[0].gain), conditions, np.append(of_light, of_cameras), solution
             )
-            moved_fit, moved_statistics = self._measured(moved, moved_conditions, number + _LINEARISED)
+            nuisances = _moved_nuisances(fit.pages, solution)
+            moved_fit, moved_statistics = self._measured(moved, moved_conditions, number + _LINEARISED, nuisances)
             if not moved_fit.deviance(statistics) < fit.deviance(statistics):
                 break
             current = moved
@@ -129,9 +140,16 @@ class DeviceFit:
             statistics = moved_statistics
             if solution.gain < _LEAST_GAIN * len(solution.step):
                 break
-        goodness = goodness_of(self._twin, self._device(current), self._pages[0])
+        goodness = self._goodness(current, conditions, fit.pages[0])
         self._progress(1.0)
         return replace(current, goodness=goodness), statistics
+
+    def _goodness(self, registered: Registered, conditions: LaunchConditions, page: FittedPage) -> Goodness:
+        """Judge a registration by the light of its first page, with its nuisance parameters in `page`."""
+        illumination = conditions.illumination
+        launched = conditions._replace(illumination=illumination * (page.gain * abs(illumination[0]) / illumination[0]))
+        known = self._pages[0]
+        return measure_goodness(self._twin, self._device(registered), launched, known.pair, known.symbols)
 
     def _device(self, registered: Registered) -> CalibratedDevice:
         return CalibratedDevice(
@@ -143,11 +161,15 @@ class DeviceFit:
         )
 
     def _measured(
-        self, registered: Registered, conditions: LaunchConditions, rounds: float
+        self,
+        registered: Registered,
+        conditions: LaunchConditions,
+        rounds: float,
+        nuisances: list[Real] | None = None,
     ) -> tuple[KnownPageFit, Statistics]:
-        """Fit the pages' nuisance parameters and the statistics of their counts, after so many finished `rounds`."""
+        """Measure the statistics of the pages' counts after so many finished `rounds`, and fit unknown `nuisances`."""
         table = light_table(self._twin, self._device(registered), conditions)
-        fit = KnownPageFit(self._likelihood, table, self._pages, registered.modulation)
+        fit = KnownPageFit(self._likelihood, table, self._pages, registered.modulation, nuisances)
         share = 1 - _LINEARISED if rounds else 0.0
         statistics = fit.statistics(conditions, lambda done: self._progress((rounds + share * done) / _ROUNDS))
         fit.table |= count_tensors(statistics.cameras, statistics.correlation)
@@ -168,14 +190,7 @@ class DeviceFit:
             *_other_steps(fit.table, registered.quadrature_phase, conditions.blur),
         ]
         evaluations = [fit.evaluate(page) for page in fit.pages]
-        columns: list[list[Real]] = []  # by unknown and page: operators are computed once for each unknown
-        for number, (tensors, step) in enumerate(steps):
-            self._progress((round_number + _LINEARISED * number / len(steps)) / _ROUNDS)
-            moved = [
-                self._likelihood.expected(page.pair, fit.table | tensors, page.phases, page.nuisance, here.places)
-                for page, here in zip(fit.pages, evaluations, strict=True)
-            ]
-            columns.append([(there - here.expected) / step for there, here in zip(moved, evaluations, strict=True)])
+        columns = self._by_steps(fit, evaluations, steps, round_number)
         parameters = np.append(of_light, of_cameras)
         common = len(columns) + len(of_cameras)
         total = common + NUISANCES * len(fit.pages)
@@ -202,6 +217,31 @@ class DeviceFit:
         gradient[blur] -= conditions.blur / _BLUR_DEVIATION**2
         information[blur, blur] += 1 / _BLUR_DEVIATION**2
         return _solution(gradient, information)
+
+    def _by_steps(
+        self,
+        fit: KnownPageFit,
+        evaluations: Sequence[Derivatives],
+        steps: Sequence[tuple[SamplingTable, float]],
+        round_number: int,
+    ) -> list[list[Real]]:
+        """Derivatives of the expected counts, [2, N] each, by step and page, by finite differences.
+
+        Args:
+            fit: fit of the pages.
+            evaluations: evaluations of the pages.
+            steps: tensors that change, and the size of each step.
+            round_number: number of finished rounds.
+        """
+        columns: list[list[Real]] = []
+        for number, (tensors, step) in enumerate(steps):  # a step's operators are computed once for all pages
+            self._progress((round_number + _LINEARISED * number / len(steps)) / _ROUNDS)
+            moved = [
+                self._likelihood.expected(page.pair, fit.table | tensors, page.phases, page.nuisance, here.places)
+                for page, here in zip(fit.pages, evaluations, strict=True)
+            ]
+            columns.append([(there - here.expected) / step for there, here in zip(moved, evaluations, strict=True)])
+        return columns
 
     def _parameter_step(self, table: SamplingTable, parameters: Real, index: int) -> tuple[SamplingTable, float]:
         """Tensors that change with a step along a parameter of the light, and the step."""
@@ -289,3 +329,12 @@ def _moved(
         conditions=moved,
     )
     return refined, moved
+
+
+def _moved_nuisances(pages: Sequence[FittedPage], solution: _Solution) -> list[Real]:
+    """Nuisance parameters of the pages after a scoring step; the illumination includes the first page's brightness."""
+    steps = solution.step[-NUISANCES * len(pages) :].reshape(len(pages), NUISANCES)
+    moved = [moved_nuisance(page, step) for page, step in zip(pages, steps, strict=True)]
+    for nuisance in moved:
+        nuisance[GAIN] /= abs(pages[0].gain)
+    return moved

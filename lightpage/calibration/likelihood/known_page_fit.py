@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
@@ -79,6 +79,7 @@ class KnownPageFit:
         table: tensors of the device's geometry and of the launched light.
         pages: known pages.
         modulation: light of the modulator at its levels.
+        nuisances: nuisance parameters of the pages, [6] each, where they are known.
 
     Attributes:
         likelihood: as given.
@@ -92,13 +93,18 @@ class KnownPageFit:
         table: SamplingTable,
         pages: Sequence[KnownPage],
         modulation: Modulation,
+        nuisances: Sequence[Real] | None = None,
     ) -> None:
         self.likelihood = likelihood
-        self.table: SamplingTable = dict(table)
-        self.pages = [FittedPage(page.pair, np.angle(page.light(modulation)), np.array(_UNIT_GAIN)) for page in pages]
+        self.table: SamplingTable = dict(table) | _neutral_count_tensors()
+        self._known = nuisances is not None
+        self.pages = [
+            FittedPage(page.pair, np.angle(page.light(modulation)), nuisance)
+            for page, nuisance in zip(pages, nuisances or [np.array(_UNIT_GAIN)] * len(pages), strict=True)
+        ]
 
     def statistics(self, conditions: LaunchConditions, progress: ProgressCallback = lambda share: None) -> Statistics:
-        """Fit the nuisance parameters, and measure the statistics of the pages' counts.
+        """Fit the nuisance parameters unless they are known, and measure the statistics of the pages' counts.
 
         Args:
             conditions: illumination and blur of the pages.
@@ -107,13 +113,13 @@ class KnownPageFit:
         Raises:
             CalibrationError: the pages' light does not agree with the device.
         """
-        evaluations = [self._fit_gain(page) for page in self.pages]
-        for number in range(_ROUNDS):
-            progress(number / (_ROUNDS + 1))
-            self.table |= count_tensors(_camera_statistics(evaluations), 1.0)
-            for page in self.pages:
-                self._gauss_newton_step(page)
-            evaluations = [self.evaluate(page) for page in self.pages]
+        evaluations = [self.evaluate(page) if self._known else self._fit_gain(page) for page in self.pages]
+        if not self._known:
+            jacobians = [self.by_nuisance(page, here) for page, here in zip(self.pages, evaluations, strict=True)]
+            for number in range(_ROUNDS):
+                progress(number / (_ROUNDS + 1))
+                self.table |= count_tensors(_camera_statistics(evaluations), 1.0)
+                evaluations = [*map(self._moved, self.pages, evaluations, jacobians)]
         cameras = _camera_statistics(evaluations)
         self.table |= count_tensors(cameras, 1.0)
         score_powers: list[float] = []
@@ -141,8 +147,10 @@ class KnownPageFit:
         Raises:
             CalibrationError: the page's counts do not depend on them.
         """
+        current = self.evaluate(page)
+        jacobian = self.by_nuisance(page, current)
         for _ in range(_ROUNDS):
-            self._gauss_newton_step(page)
+            current = self._moved(page, current, jacobian)
 
     def evaluate(self, page: FittedPage, nuisance: Real | None = None, phases: Real | None = None) -> Derivatives:
         """Evaluate the likelihood of a page at its own phases and nuisance parameters, or at those given."""
@@ -193,15 +201,17 @@ class KnownPageFit:
             total += float(np.mean(score**2 / score_power + np.log(information / by_score**2)))
         return total / len(self.pages)
 
-    def move(self, page: FittedPage, step: Real) -> None:
-        """Change a page's nuisance parameters by a step: relative gain, its phase, tilt and shift, [6]."""
-        gain = page.gain * (1 + step[0]) * np.exp(1j * step[1])
-        page.nuisance = np.array([gain.real, gain.imag, *(page.nuisance[2:] + step[2:])])
+    def _moved(self, page: FittedPage, current: Derivatives, jacobian: Real) -> Derivatives:
+        """Change a page's nuisance parameters by a Gauss-Newton step.
 
-    def _gauss_newton_step(self, page: FittedPage) -> None:
-        """Change a page's nuisance parameters by a Gauss-Newton step."""
-        current = self.evaluate(page)
-        jacobian = self.by_nuisance(page, current)
+        Args:
+            page: the page.
+            current: its evaluation.
+            jacobian: Jacobian [6, 2, N] of the expected counts; it hardly changes within the range of the fit.
+
+        Returns:
+            The evaluation with the counts that are expected after the step.
+        """
         precision = nuisance_precision()
         normal = self.normal_matrix(jacobian, current) + np.diag(precision)
         gradient = self.gradient(jacobian, current) - precision * page.nuisance
@@ -210,14 +220,14 @@ class KnownPageFit:
         except np.linalg.LinAlgError:
             got = "counts that do not change with the brightness of their page"
             raise CalibrationError("calibration, known pages", got, "the light of known pages") from None
-        self.move(page, np.asarray(step, np.float64))
+        page.nuisance = moved_nuisance(page, np.asarray(step, np.float64))
+        return replace(current, expected=self._expected(page, page.nuisance, current.places))
 
     def _fit_gain(self, page: FittedPage) -> Derivatives:
         """Fit a page's gain without statistics, set its nuisance parameters to it, and evaluate the page there.
 
         The expected counts are a quadratic in the gain, which four evaluations determine.
         """
-        self.table |= _neutral_count_tensors()
         current = self.evaluate(page, np.array(_UNIT_GAIN))
         stride = slice(None, None, max(1, current.places.size // _GAIN_SAMPLES))
         counts = current.counts[:, stride]
@@ -245,6 +255,12 @@ class KnownPageFit:
     def _expected(self, page: FittedPage, nuisance: Real, places: NDArray[np.intp]) -> Real:
         """Expected counts of a page with other nuisance parameters, [2, N]."""
         return self.likelihood.expected(page.pair, self.table, page.phases, nuisance, places)
+
+
+def moved_nuisance(page: FittedPage, step: Real) -> Real:
+    """Nuisance parameters [6] of a page after a step: relative gain, its phase, tilt and shift, [6]."""
+    gain = page.gain * (1 + step[0]) * np.exp(1j * step[1])
+    return np.array([gain.real, gain.imag, *(page.nuisance[2:] + step[2:])])
 
 
 def _nuisance_steps(page: FittedPage) -> list[Real]:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from lightpage.calibration.likelihood.table import PIXEL_GAINS
+from lightpage.calibration.likelihood.table import FLAT_FIELD, PIXEL_GAINS
 from lightpage.calibration.sampling_table import APART
 from lightpage.calibration.waves.wave_model import illumination_terms
 from lightpage.device.profile import Profile
@@ -32,7 +32,7 @@ FORWARD = Fidelity(0.005, 0.007)
 """Fidelity of the predicted light."""
 BACKWARD = Fidelity(0.06, 0.05)
 """Fidelity of the adjoint. An error of the adjoint moves the estimate only by the same share of the noise."""
-OPERATOR_INPUTS = ("parameters", "blur", "illumination")
+OPERATOR_INPUTS = ("parameters", "blur", "illumination", FLAT_FIELD)
 """Tensors of a table that the wave operators follow from."""
 _EVERY = 4
 """Distance, in grid samples, between the residuals that chi-square uses."""
@@ -45,7 +45,7 @@ class Operators(NamedTuple):
 
     Attributes:
         forward, backward: matrices to the cameras, and back.
-        illumination: light of the modulator's samples of phase zero and unit amplitude, [ny S, nx S].
+        illumination: light of the modulator's samples where a symbol shows phase zero and unit amplitude, [ny S, nx S].
     """
 
     forward: WaveMatrices
@@ -158,12 +158,13 @@ class PhaseEstimator(nn.Module):
         self._half_width, self._half_height = profile.page_width_m / 2, profile.page_height_m / 2
 
     def operators(self, table: Mapping[str, Tensor]) -> Operators:
-        """Return the wave operators of `parameters`, `blur` and `illumination` in the table."""
+        """Return the wave operators of the tensors `OPERATOR_INPUTS` in the table."""
         parameters, blur = table["parameters"], table["blur"]
         terms = torch.stack(illumination_terms(self.waves.x_m / self._half_width, self.waves.y_m / self._half_height))
-        real, imaginary = torch.tensordot(table["illumination"], terms, 1).unbind()
+        smooth = parts(torch.tensordot(table["illumination"], terms, 1))
+        illumination = multiply(smooth, phasor(to_samples(table[FLAT_FIELD], self.samples)))
         forward, backward = self.waves.matrices(parameters, blur), self.back.matrices(parameters, blur)
-        return Operators(forward, backward, (real, imaginary))
+        return Operators(forward, backward, illumination)
 
     def measured(self, table: Mapping[str, Tensor], *frames: Tensor) -> tuple[Page, Measured]:
         """Measure a frame pair on the common grid.

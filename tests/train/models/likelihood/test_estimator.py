@@ -1,7 +1,7 @@
 """Claims about maximum likelihood: its derivatives are those of the likelihood, and its steps read pages."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from lightpage.calibration.calibrate import KnownPage
 from lightpage.calibration.likelihood.counts import CountStatistics
 from lightpage.calibration.likelihood.known_page_fit import KnownPageFit
 from lightpage.calibration.likelihood.measure import estimator_table, light_table
-from lightpage.calibration.likelihood.table import count_tensors, pilot_tensors
+from lightpage.calibration.likelihood.table import FLAT_FIELD, count_tensors, pilot_tensors
 from lightpage.calibration.sampling_table import APART, SamplingTable
 from lightpage.calibration.waves.wave_fit import WaveFit
 from lightpage.calibration.waves.wave_model import LaunchConditions
@@ -242,6 +242,15 @@ def test_turned_pilots_turn_the_answer_and_the_gain(
         assert np.abs(wrapped(decoded(turned) - decoded(straight) - turn)).max() < 1e-3
         gain, found = (complex(*each.nuisance[:2].tolist()) for each in (straight, turned))
         assert found == pytest.approx(gain * np.exp(-1j * turn), abs=1e-3)
+
+
+def test_a_flat_field_is_taken_off_the_answer(fitted: Fitted, pages: tuple[np.ndarray, FramePair, FramePair]) -> None:
+    phases, pair, _ = pages
+    flat = np.random.default_rng(0).normal(0, 0.05, phases.shape).astype(np.float32)
+    flat -= flat[MASK].mean()
+    corrected = replace(fitted, table=fitted.table | {FLAT_FIELD: flat})
+    without, corrected_answer = (decoded(each.read(pair, phases)[0][-1]) for each in (fitted, corrected))
+    np.testing.assert_allclose(wrapped(corrected_answer - without), -flat, atol=0.004)
 
 
 def test_deviations_of_the_modulators_samples_are_told_from_the_symbols_phases(fitted: Fitted) -> None:
