@@ -133,7 +133,7 @@ def estimated_device(
     )
     recorded_mask = recording.pilots()
     mask = pilot_mask(profile) if recorded_mask is None else recorded_mask
-    own = own_pilots(recording, profile, mask, used)
+    own = own_pilots(recording, profile, mask, [*range(recording.pages)])
     table |= pilot_tensors(_pilots(device, mask, own))
     table[NOISE] = np.tile(np.array([1, 0], np.float32), (MOST_STEPS + 1, 1))
     table[DEVIATION_PRECISION] = NO_DEVIATIONS

@@ -16,7 +16,7 @@ from torch.utils import _pytree as tree
 from lightpage.calibration.likelihood.table import PILOT_MASK, PILOT_PHASORS
 from lightpage.calibration.sampling_table import APART, SamplingTable
 from lightpage.export.graph import FRAME_INPUTS, TABLE_INPUTS, answers
-from lightpage.export.onnx_files import exported
+from lightpage.export.onnx_files import exported, sharing
 from lightpage.export.operators.device_constants import move_device_constants
 from lightpage.runtime.model.execution.estimator_graph import (
     EARLY_STEPS,
@@ -308,6 +308,7 @@ def whole_onnx(files: EstimatorFiles, steps: int, table: SamplingTable) -> bytes
     frames = {entry.name: entry for entry in first.graph.input}
     whole.graph.output.extend(outputs[name] for name in WholeGraph.outputs)
     whole.graph.input.extend(frames[name] for name in FRAME_INPUTS)
+    sharing(whole)
     _add_inputs_with_defaults(whole, table)
     onnx.checker.check_model(whole)
     return bytes(whole.SerializeToString())

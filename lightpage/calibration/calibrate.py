@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -179,6 +179,8 @@ _LEAST_OF_BEST = 0.8
 
 _APART = "waves of cameras apart"
 _STATE = ("parameters", "deviations", "quadrature_phase", "modulation", "conditions", "fit", "_looked", "_found")
+_HELD = 1e-6
+"""Share of a prior that leaves a parameter where it is."""
 
 
 def calibrate(
@@ -329,6 +331,29 @@ def refine(
         work.complex_field(replace(stage, groups=known), _DRIFT_SCALE)
     work.waves("waves", known, _DRIFT_SCALE)
     return work.result()
+
+
+def goodness_of(
+    twin: Twin, device: CalibratedDevice, page: KnownPage, progress: Callable[[float], None] = lambda share: None
+) -> Goodness:
+    """Verdict on a device that is held as it is, by the light of a known page.
+
+    Args:
+        twin: of the nominal device.
+        device: that is judged.
+        page: that it shows.
+        progress: told of each of two steps, 0 to 1. It may raise to stop the work.
+
+    Raises:
+        CalibrationError: the cameras see no symbol.
+    """
+    start, group = device.parameters, ("launch",)  # with it the illumination does not bend the page's phases
+    fit = WaveFit(twin, device.profile, page.pair, device.references, page.symbols)
+    turn, levels = device.quadrature_phase_rad, device.modulation
+    found = fit.fit(start, turn, group, start, _HELD, progress, levels, effort="once")
+    if not np.isfinite(found.residual):
+        raise CalibrationError("calibration, verdict", "no light of a page", "some")
+    return measure_goodness(twin, device, found.conditions, page.pair, page.symbols, progress)
 
 
 def least_coherence(symbols: int) -> float:

@@ -130,6 +130,7 @@ def choose(
     headroom: float = HEADROOM,
     seed: int = 0,
     drift: Drift | None = None,
+    margin: float | None = None,
 ) -> tuple[Choice, list[Choice]]:
     """The code that carries most, and the best of each level count.
 
@@ -140,9 +141,11 @@ def choose(
         headroom: share of what a symbol carries that is kept for drift.
         seed: seed of the draws.
         drift: drift that pages are to survive, where it costs more than that share.
+        margin: share of a page's information that the weakest page may lack. It is used when there are too few pages to
+            measure their spread; None otherwise.
 
     Raises:
-        InvalidInputError: too few pages, or no code carries a page.
+        InvalidInputError: too few pages to show it, or no code carries a page.
     """
     tried: list[Choice] = []
     near = range(max(1, int(air_bits) - 1), min(_MOST_BITS, int(np.ceil(air_bits)) + 1) + 1)
@@ -153,9 +156,9 @@ def choose(
         rng = np.random.default_rng([seed, bits])
         pages = draw(1 << bits, rng)
         count = len(pages)
-        if count < FEWEST_PAGES:
+        if count < FEWEST_PAGES and margin is None:
             raise InvalidInputError("pages to choose a code by", count, f"at least {FEWEST_PAGES}")
-        choice = _best_of(draw, pages, 1 << bits, pilots, headroom * air_bits, rng, drift)
+        choice = _best_of(draw, pages, 1 << bits, pilots, headroom * air_bits, rng, drift, margin)
         if choice is not None:
             tried.append(choice)
     if not tried:
@@ -175,6 +178,7 @@ def _best_of(
     kept_bits: float,
     rng: np.random.Generator,
     drift: Drift | None,
+    margin: float | None,
 ) -> Choice | None:
     """The best code of a level count that leaves `kept_bits` of a symbol, or what a drift costs, whichever is more.
 
@@ -191,9 +195,15 @@ def _best_of(
             break
     else:
         return None
-    deviation = float(information.std(ddof=1))
+    mean = float(information.mean())
+    if margin is None:
+        deviation = float(information.std(ddof=1))
+        below = tolerance_factor(len(pages)) * deviation
+    else:
+        below = margin * mean
+        deviation = below / _QUANTILE
     kept = max(kept_bits / coded, lost)
-    weakest = float(information.mean()) - tolerance_factor(len(pages)) * deviation - kept
+    weakest = mean - below - kept
     lowest = _LOWEST_RATE_OF_TWO_LEVELS if levels == MIN_LEVELS else _LOWEST_RATE
     rate, tried = min(_HIGHEST_RATE, _stepped(weakest - _FIRST_GAP)), 0
     while True:  # the gap to the code's limit changes little with the rate
@@ -211,7 +221,7 @@ def _best_of(
         rate -= 2 * _RATE_STEP
     user_bytes = PageCodec(code, pilots).user_bytes
     spare = weakest + kept - needed
-    return Choice(code, user_bytes, float(information.mean()), deviation, float(wrong.mean()), kept, spare)
+    return Choice(code, user_bytes, mean, deviation, float(wrong.mean()), kept, spare)
 
 
 def survives(choice: Choice, drift: Drift, pilots: NDArray[np.bool_]) -> tuple[bool, float]:
@@ -257,7 +267,8 @@ def _stepped(information: float) -> int:
 
 def _label_bits(symbols: NDArray[np.uint8], coded: int) -> NDArray[np.uint8]:
     """Label bits of symbols, [symbols, b]."""
-    return np.asarray(labels(coded)[symbols % (1 << coded)][:, None] >> np.arange(coded) & 1, np.uint8)
+    coset = symbols.astype(np.int64) % (1 << coded)
+    return np.asarray(labels(coded)[coset][:, None] >> np.arange(coded) & 1, np.uint8)
 
 
 def _information(page: DrawnPage, coded: int) -> tuple[float, int]:

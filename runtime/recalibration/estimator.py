@@ -14,8 +14,8 @@ from lightpage.calibration.interfaces import Twin
 from lightpage.calibration.likelihood.interfaces import Derivatives, ProgressCallback, Real, at_places, chosen_evenly
 from lightpage.calibration.likelihood.measure import estimator_table
 from lightpage.calibration.likelihood.statistics import Statistics
-from lightpage.calibration.likelihood.table import MEASUREMENT_INPUTS, known_p
-from lightpage.calibration.sampling_table import SamplingTable
+from lightpage.calibration.likelihood.table import FLAT_FIELD, MEASUREMENT_INPUTS, known_p
+from lightpage.calibration.sampling_table import APART, SamplingTable
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.execution.estimator_graph import DERIVATIVES, NOISE, EstimatorGraph
 from lightpage.runtime.recalibration.noise import KnownPhases, deviation_prior_scale, measured_noise
@@ -42,6 +42,10 @@ class GraphLikelihood:
         self._key: list[bytes] = []
         self._measured_by: list[bytes] = []
         self._pages: dict[int, tuple[FramePair, dict[str, NDArray[Any]]]] = {}
+
+    def apart_inputs(self, device: CalibratedDevice) -> tuple[str, ...]:
+        """See `PageLikelihood`. A graph takes the same tensors whatever the device needs."""
+        return tuple(name for name in APART if name in self.graph.ports)
 
     def __call__(self, pair: FramePair, table: SamplingTable, phases: Real, nuisance: Real) -> Derivatives:
         """See `PageLikelihood`."""
@@ -117,4 +121,5 @@ def measured_table(
     known = [KnownPhases.of(page, device) for page in pages]
     steps = len(graph.value(NOISE)) - 1
     prior_scale = deviation_prior_scale(device.profile, statistics)
-    return table | measured_noise(graph.with_table(table), known, mask, prior_scale, steps)
+    earlier = graph.value(FLAT_FIELD) if FLAT_FIELD in graph.ports else None
+    return table | measured_noise(graph.with_table(table), known, mask, prior_scale, steps, earlier)

@@ -13,6 +13,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lightpage.calibration.calibrate import KnownPage, goodness_of, refine
 from lightpage.calibration.calibrated_device import CalibratedDevice
@@ -41,7 +42,7 @@ from lightpage.runtime.model.decoding.image_position import ImagePosition
 from lightpage.runtime.model.execution.twin import OnnxTwin
 from lightpage.runtime.recalibration.known_pages import KnownPages
 from lightpage.runtime.recalibration.recalibration import Refit, RefitResult, refitted_bundle
-from lightpage.runtime.recalibration.refit import refit, traced
+from lightpage.runtime.recalibration.refit import blemishes_of, refit, traced
 from lightpage.runtime.recalibration.unknown_pages import UnknownPages
 
 TOGETHER = 6
@@ -191,7 +192,8 @@ class _Healing:
             raise RecalibrationRefusedError("healing", "no page with light", "at least one")
         if pages.references is not None:
             decoder.check(pages.references, "reference: ")
-        self._references = pages.references or decoder.references
+        self._blemishes = blemishes_of(decoder, pages.references)
+        self._references = self._blemishes.references
         self._levels = pages.code.levels
         self.pairs = tuple(pages.pairs[number] for number in taken)
         expected = tuple(pages.expected[number] if pages.expected else None for number in taken)
@@ -224,7 +226,8 @@ class _Healing:
 
     def _with(self, calibration: Calibration) -> tuple[Decoder, RefitResult]:
         """The decoder with another geometry, and what was re-fitted for it."""
-        result = traced(self._decoder, self._twin, self._references, calibration)
+        gains = self._blemishes.gains
+        result = traced(self._decoder, self._twin, self._references, calibration, gains=gains)
         return self._decoder.of_bundle(refitted_bundle(self._decoder.bundle, result)), result
 
     def _read(self, model: _Model) -> tuple[PageBytes, ...]:
@@ -260,7 +263,7 @@ class _Healing:
         pairs = tuple(pair for _, pair in read)
         mask, near = model.decoder.bundle.pilot_mask, self._near(model) if model.fitted else None
         fitted = tuple(map(hash_frames, model.fitted))
-        return KnownPages(pairs, symbols, self._levels, self._references, mask, image_px, near, fitted)
+        return KnownPages(pairs, symbols, self._levels, self._pages.references, mask, image_px, near, fitted)
 
     def _near(self, model: _Model) -> CalibratedDevice:
         """Return the device as a model has it."""
@@ -277,7 +280,7 @@ class _Healing:
             self._decoder.field_solver,
             profile,
             self._references,
-            [KnownPage(self.pairs[page], np.exp(1j * symbol_phases(symbols, self._levels)))],
+            [self._known_page(self.pairs[page], symbols)],
             start=earlier.vector,
             quadrature_phase=earlier.turn_rad,
             progress=progress,
@@ -289,14 +292,18 @@ class _Healing:
         found = earlier.followed_by(Calibration.from_registered(registered, profile, [*hashes]))
         return model.by(self.pairs[page], *self._with(found))
 
+    def _known_page(self, pair: FramePair, symbols: NDArray[np.uint8]) -> KnownPage:
+        """Return a page without the cameras' blemishes."""
+        return KnownPage(self._blemishes.corrected(pair), np.exp(1j * symbol_phases(symbols, self._levels)))
+
     def judged(self, model: _Model, known: KnownPages, progress: Progress) -> _Model:
         """The model with the verdict on its geometry, by the light of the first known page.
 
         A fit to decisions gives none: those that are wrong would count as light that the geometry does not explain.
         That of a geometry that has only been moved is of before.
         """
-        bundle, symbols = model.decoder.bundle, np.exp(1j * symbol_phases(known.symbols[0], self._levels))
-        page = KnownPage(known.pairs[0], symbols)
+        bundle = model.decoder.bundle
+        page = self._known_page(known.pairs[0], known.symbols[0])
         goodness = goodness_of(self._twin, self._near(model), page, lambda _: progress("unexplained light", 1.0))
         return _Model(*self._with(bundle.calibration.model_copy(update={"goodness": goodness})), model.fitted)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -27,10 +28,16 @@ from lightpage.runtime.model.execution.estimator_graph import (
 )
 from lightpage.waves.grid import symbol_samples
 
+Real = NDArray[np.float64]
+
 MOST_STEPS = 6
 """Largest number of Gauss-Newton steps."""
 _LEAST_GAIN_BITS = 0.004
 """Least gain of information for another step, for a flat field, and for the estimation of deviations, bits a symbol."""
+_LEAST_DIFFERENCE_RAD = 0.01
+"""Least difference of two symbols' phases that is one."""
+_UNIT_NOISE = np.array([1, 0], np.float32)
+"""Noise with which concentrations are the Fisher information."""
 
 
 class KnownPhases(NamedTuple):
@@ -70,31 +77,60 @@ def measured_noise(
     mask: NDArray[np.bool_],
     prior_scale: float,
     steps: int | None = None,
+    earlier_flat_field: NDArray[np.floating] | None = None,
 ) -> SamplingTable:
     """Measure the noise of the first estimate and after each step, the flat field, and the prior of the deviations.
 
     Deviations of the modulator's samples are estimated only if known pages are read better with them. There is a flat
-    field only if each known page is read better, on average, with that of the others.
+    field only if known pages are read better with it: with the one from before, or each with that of the others.
 
     Args:
-        graph: graph of the device without a flat field, with at least `steps` steps, or `MOST_STEPS` if these are left out.
+        graph: graph of the device, with at least `steps` steps, or `MOST_STEPS` if these are left out.
         pages: known pages.
         mask: positions of the pilots, bool [ny, nx].
         prior_scale: see `deviation_prior_scale`.
         steps: number of steps; if left out, as many as gain information.
+        earlier_flat_field: flat field of the device before a re-fit, radians [ny, nx].
 
     Returns:
-        `NOISE` [steps + 1, 2], `FLAT_FIELD` [ny, nx] and `DEVIATION_PRECISION` [].
+        `NOISE` [steps + 1, 2] and `DEVIATION_PRECISION` []; `FLAT_FIELD` [ny, nx] where the graph takes one.
     """
-    information = graph.value("information")[~mask].astype(np.float64)
-    fixed = _measured(graph.with_table({DEVIATION_PRECISION: NO_DEVIATIONS}), pages, mask, steps)
-    variance = float(np.mean(fixed.noise[-1, 0] / information + fixed.noise[-1, 1]))
-    precision = np.array(1 / (prior_scale * variance), np.float32)
-    fitted = _measured(graph.with_table({DEVIATION_PRECISION: precision}), pages, mask, steps)
+    most = MOST_STEPS if steps is None else steps
+    table = {NOISE: np.tile(_UNIT_NOISE, (len(graph.value(NOISE)), 1))} | _without_flat_field(graph, mask)
+    known = _KnownPages(graph.with_table(table), pages, mask, earlier_flat_field)
+    fixed = known.measured(NO_DEVIATIONS, most, until_no_gain=steps is None)
+    precision = np.array(1 / (prior_scale * fixed.variance), np.float32)
+    fitted = known.measured(precision, most, until_no_gain=steps is None)
     if fitted.bits < fixed.bits + _LEAST_GAIN_BITS:
         fitted = fixed
         precision = NO_DEVIATIONS
-    return {NOISE: fitted.noise, FLAT_FIELD: fitted.flat_field.astype(np.float32), DEVIATION_PRECISION: precision}
+    flat = {name: fitted.flat_field.astype(np.float32) for name in _without_flat_field(graph, mask)}
+    return {NOISE: fitted.noise, DEVIATION_PRECISION: precision, **flat}
+
+
+def _without_flat_field(graph: EstimatorGraph, mask: NDArray[np.bool_]) -> SamplingTable:
+    """Return a flat field of zero, if the graph takes one."""
+    return {FLAT_FIELD: np.zeros(mask.shape, np.float32)} if FLAT_FIELD in graph.ports else {}
+
+
+class _Errors(NamedTuple):
+    """Errors of the pages' phases after a step.
+
+    Attributes:
+        phases: estimated phases minus known ones, radians [K, ny, nx].
+        information: Fisher information of the phases, [K, ny, nx].
+    """
+
+    phases: Real
+    information: Real
+
+    def noise(self, flat_fields: Real, data: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """Fit the noise of the data symbols, [2], where each page has a flat field, [K, ny, nx]."""
+        return fitted_noise((self.phases - flat_fields)[:, data].ravel(), self.information[:, data].ravel())
+
+    def bits(self, noise: NDArray[np.float32], data: NDArray[np.bool_]) -> float:
+        """Expected information of the data symbols, bits a symbol."""
+        return expected_bits(noise, self.information[:, data].ravel())
 
 
 class _Measured(NamedTuple):
@@ -102,51 +138,108 @@ class _Measured(NamedTuple):
 
     Attributes:
         noise: noise after each step, [steps + 1, 2].
-        flat_field: mean error of the symbols' phases after the last step, radians [ny, nx].
+        flat_field: flat field after the last step, radians [ny, nx]; zero where it does not help.
         bits: expected information after the last step, bits a symbol.
+        variance: median of the expected squares of the errors after the last step, rad^2.
     """
 
     noise: NDArray[np.float32]
-    flat_field: NDArray[np.float64]
+    flat_field: Real
     bits: float
+    variance: float
 
 
-def _measured(
-    graph: EstimatorGraph, pages: Sequence[KnownPhases], mask: NDArray[np.bool_], steps: int | None
-) -> _Measured:
-    """Measure noise and flat field.
+class _KnownPages:
+    """Known pages that a graph reads step by step.
 
-    An error is reduced by the flat field of the other pages. That is what a graph with this flat field would give, to
-    first order, and needs no further runs.
+    An error is reduced by a flat field of other pages. That is what a graph with this flat field would give, to first
+    order, and needs no further runs.
+
+    Args:
+        graph: graph of the device with unit noise and no flat field.
+        pages: known pages.
+        mask: positions of the pilots, bool [ny, nx].
+        earlier_flat_field: see `measured_noise`.
     """
-    most = MOST_STEPS if steps is None else steps
-    noise = np.tile(np.array([1, 0], np.float32), (len(graph.value(NOISE)), 1))
-    information = graph.value("information")[~mask].astype(np.float64)
-    everywhere = np.tile(information, len(pages))
-    flat = np.zeros(mask.shape)
-    bits = 0.0
-    for number in range(most + 1):
-        graph = graph.with_table({NOISE: noise})
-        errors = np.stack([_errors(graph, page, mask, number) for page in pages])
-        repeated = flat_field(errors)
-        row = fitted_noise(errors[:, ~mask].ravel(), everywhere)
-        reached = expected_bits(row, information)
-        corrected_row = fitted_noise((errors - repeated.by_others)[:, ~mask].ravel(), everywhere)
-        helps = expected_bits(corrected_row, information) >= reached + _LEAST_GAIN_BITS
-        if helps:
-            row = corrected_row
-            reached = expected_bits(row, information)
-        if steps is None and number > 1 and reached < bits + _LEAST_GAIN_BITS:
-            return _Measured(noise[:number], flat, bits)
-        noise[number] = row
-        flat = repeated.phases if helps else np.zeros_like(repeated.phases)
-        bits = reached
-    return _Measured(noise[: most + 1], flat, bits)
+
+    def __init__(
+        self,
+        graph: EstimatorGraph,
+        pages: Sequence[KnownPhases],
+        mask: NDArray[np.bool_],
+        earlier_flat_field: NDArray[np.floating] | None,
+    ) -> None:
+        self._graph = graph
+        self._pages = pages
+        self._feeds = [page.feeds(mask) for page in pages]
+        self._mask = mask
+        self._data = ~mask
+        self._nothing = np.zeros((len(pages), *mask.shape))
+        self._earlier = earlier_flat_field
+        self._takes_flat_field = FLAT_FIELD in graph.ports
+        self._distinct = all(_differ(one, other) for one, other in itertools.combinations(pages, 2))
+
+    def measured(self, precision: NDArray[np.float32], most: int, *, until_no_gain: bool) -> _Measured:
+        """Measure noise and flat field.
+
+        Args:
+            precision: inverse variance of the modulator's deviations.
+            most: largest number of steps.
+            until_no_gain: whether steps end where they gain no information.
+        """
+        graph = self._graph.with_table({DEVIATION_PRECISION: precision})
+        states = [graph.first_estimate(feeds) for feeds in self._feeds]
+        errors: list[_Errors] = []
+        best: _Measured | None = None
+        for number in range(most + 1):
+            if number:
+                states = [graph.step(*each, number) for each in zip(states, self._feeds, strict=True)]
+            errors.append(self._errors([state["p"] for state in states]))
+            flat, by_others = self._flat_field(errors[-1])
+            row = errors[-1].noise(by_others, self._data)
+            bits = errors[-1].bits(row, self._data)
+            if until_no_gain and number > 1 and best is not None and bits < best.bits + _LEAST_GAIN_BITS:
+                break
+            variance = float(np.median(row[0] / errors[-1].information[:, self._data] + row[1]))
+            noise = np.stack([each.noise(by_others, self._data) for each in errors])
+            best = _Measured(noise, flat, bits, variance)
+            states = [{**state, "p": _with_noise(state["p"], row)} for state in states]
+        assert best is not None
+        return best
+
+    def _errors(self, answers: Sequence[NDArray[np.float32]]) -> _Errors:
+        """Compare the pages' answers p [2, ny, nx], of unit noise, with the known phases."""
+        phases: list[Real] = []
+        for p, page in zip(answers, self._pages, strict=True):
+            error = wrapped(np.arctan2(p[1], p[0]).astype(np.float64) - page.phases)
+            piston = np.angle(np.mean(np.exp(1j * error[self._mask])))
+            phases.append(np.asarray(wrapped(error - piston)))
+        return _Errors(np.stack(phases), np.stack([np.hypot(*p).astype(np.float64) for p in answers]))
+
+    def _flat_field(self, errors: _Errors) -> tuple[Real, Real]:
+        """Return the flat field [ny, nx] that helps most, and for each page one that it has no part in, [K, ny, nx]."""
+        plain = errors.noise(self._nothing, self._data)
+        candidates: list[tuple[Real, Real]] = []
+        if self._takes_flat_field and self._distinct:
+            variance = np.mean(plain[0] / errors.information + plain[1], axis=0)
+            candidates.append(flat_field(errors.phases, variance))
+        if self._takes_flat_field and self._earlier is not None and self._earlier.any():
+            candidates.append((np.asarray(self._earlier, np.float64), self._nothing + self._earlier))
+        best = self._nothing[0], self._nothing
+        most = errors.bits(plain, self._data) + _LEAST_GAIN_BITS
+        for flat, by_others in candidates:
+            bits = errors.bits(errors.noise(by_others, self._data), self._data)
+            if bits >= most:
+                best = flat, by_others
+                most = bits
+        return best
 
 
-def _errors(graph: EstimatorGraph, page: KnownPhases, mask: NDArray[np.bool_], steps: int) -> NDArray[np.float64]:
-    """Errors of the symbols' phases after so many steps, radians [ny, nx]."""
-    (p,) = graph.run(["p"], page.feeds(mask), steps)
-    error = wrapped(np.arctan2(p[1], p[0]).astype(np.float64) - page.phases)
-    piston = np.angle(np.mean(np.exp(1j * error[mask])))
-    return np.asarray(wrapped(error - piston))
+def _with_noise(p: NDArray[np.float32], noise: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Give an answer p [2, ny, nx] of unit noise the concentrations of other noise, [2]."""
+    return np.asarray(p / (noise[0] + noise[1] * np.hypot(*p)), np.float32)
+
+
+def _differ(one: KnownPhases, other: KnownPhases) -> bool:
+    """Return whether most symbols of two pages differ. What a model lacks for one page repeats on the same page."""
+    return bool(np.mean(np.abs(wrapped(one.phases - other.phases)) > _LEAST_DIFFERENCE_RAD) > 0.5)

@@ -1,5 +1,10 @@
 """Finds the geometry of a drive that a model was never calibrated for, by pages of user data written for its make."""
 
+from dataclasses import replace
+
+import numpy as np
+
+from lightpage.calibration.likelihood.table import FLAT_FIELD
 from lightpage.calibration.parameters import as_dict
 from lightpage.calibration.unknown_pages.device_search import find_device
 from lightpage.errors import CalibrationError, RecalibrationRefusedError, raised_as
@@ -12,7 +17,7 @@ from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.execution.twin import OnnxTwin
 from lightpage.runtime.recalibration.healing import LostPages
 from lightpage.runtime.recalibration.recalibration import refitted_bundle
-from lightpage.runtime.recalibration.refit import traced
+from lightpage.runtime.recalibration.refit import blemishes_of, traced
 
 MOST_PAGES = 8
 """Pages at most that a device is found by."""
@@ -36,9 +41,10 @@ def of_other_device(decoder: Decoder, pages: LostPages, progress: Progress) -> D
     bundle, levels = decoder.bundle, pages.code.levels
     distinct = {hash_frames(pair): pair for pair in pages.pairs[:MOST_PAGES]}
     with raised_as(RecalibrationRefusedError, CalibrationError):
-        twin, references = OnnxTwin(bundle), pages.references or decoder.references
+        twin, blemishes = OnnxTwin(bundle), blemishes_of(decoder, pages.references)
         pilots = Pilots(bundle.pilot_mask, symbol_phases(bundle.written_pilots(levels), levels))
-        found = find_device(twin, bundle.profile, list(distinct.values()), references, pilots, progress)
+        pairs = [blemishes.corrected(pair) for pair in distinct.values()]
+        found = find_device(twin, bundle.profile, pairs, blemishes.references, pilots, progress)
         start = bundle.calibration.model_copy(
             update={
                 "parameters": as_dict(found.parameters),
@@ -50,4 +56,6 @@ def of_other_device(decoder: Decoder, pages: LostPages, progress: Progress) -> D
                 "calibrated_pages": tuple(distinct),
             }
         )
-        return decoder.of_bundle(refitted_bundle(bundle, traced(decoder, twin, references, start)))
+        result = traced(decoder, twin, blemishes.references, start, gains=blemishes.gains)
+        without_flat_field = decoder.taken({FLAT_FIELD: np.zeros(bundle.profile.page_shape, np.float32)})
+        return decoder.of_bundle(refitted_bundle(bundle, replace(result, table=result.table | without_flat_field)))

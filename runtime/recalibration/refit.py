@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lightpage.calibration.calibrate import LEAST_KEPT, KnownPage, refine
 from lightpage.calibration.document import BlemishCounts, Calibration
@@ -48,7 +49,8 @@ def refit(
 
     Args:
         bundle: bundle with calibration and twin.
-        pages: known pages; the first finds the geometry, the coherences are the mean of all.
+        pages: known pages; the first finds the geometry, and all of them refine it where the bundle reads by maximum
+            likelihood. The coherences are the mean of all.
         progress: told of every stage.
         decoder: the bundle's, whose graph recovers the field.
         twin: twin of the bundle's profile; the bundle's own if left out.
@@ -65,7 +67,7 @@ def refit(
         expected = f"{among}: this decoder holds its geometry itself; calibrate, train and export anew"
         raise BundleError(f"{bundle.subject}: table inputs", sorted(decoder.graph.ports), expected)
     graph = decoder.graph
-    blemishes = _blemishes(decoder, pages.references)
+    blemishes = blemishes_of(decoder, pages.references)
     references = blemishes.references
     twin = OnnxTwin(bundle) if twin is None else twin
     progress("find the image", 0.0)
@@ -134,13 +136,12 @@ def refit(
         mask,
         lambda share: progress("noise of the estimator", share),
     )
-    result = traced(decoder, twin, references, fitted, image)
-    gains = {name: blemishes.gains for name in without_blemishes}
-    return replace(result, table={**result.table, **measured, **gains})
+    result = traced(decoder, twin, references, fitted, image, blemishes.gains)
+    return replace(result, table={**result.table, **measured})
 
 
-def _blemishes(decoder: Decoder, references: FramePair | None) -> Blemishes:
-    """Blemishes of the cameras: of new references, or as the bundle has them.
+def blemishes_of(decoder: Decoder, references: FramePair | None) -> Blemishes:
+    """Return the cameras' blemishes: those of new references, or as the bundle has them.
 
     Graphs that take no gains read frames with their blemishes, and are fitted with them.
     """
@@ -163,7 +164,12 @@ def check_as_good(earlier: Calibration, fitted: Calibration) -> None:
 
 
 def traced(
-    decoder: Decoder, twin: Twin, references: FramePair, fitted: Calibration, image: ImagePosition | None = None
+    decoder: Decoder,
+    twin: Twin,
+    references: FramePair,
+    fitted: Calibration,
+    image: ImagePosition | None = None,
+    gains: NDArray[np.uint8] | None = None,
 ) -> RefitResult:
     """The table of a re-fitted geometry.
 
@@ -173,6 +179,7 @@ def traced(
         references: references that the geometry was fitted with.
         fitted: the geometry.
         image: where its image was found, None where it was not, or not looked for.
+        gains: gains of the cameras' pixels, see `Blemishes`; as the decoder has them if left out.
     """
     profile = decoder.bundle.profile
     if not set(apart_inputs(fitted.vector)) <= decoder.graph.ports.keys():
@@ -182,6 +189,8 @@ def traced(
         "reference_quadrature": references.quadrature,
         **sampling_table(twin, fitted.vector, fitted.turn_rad, profile),
     }
+    if gains is not None:
+        table[PIXEL_GAINS] = gains
     if (statistics := fitted.statistics) is not None:
         table |= launch_tensors(profile, fitted.vector, statistics.conditions, fitted.modulator)
     return RefitResult(

@@ -12,18 +12,23 @@ from lightpage.calibration.document import Calibration, load_calibration
 from lightpage.calibration.known_pages import known_pages
 from lightpage.calibration.likelihood.known_page_fit import KnownPageFit
 from lightpage.calibration.likelihood.measure import light_table
-from lightpage.calibration.likelihood.table import pilot_tensors
+from lightpage.calibration.likelihood.table import FLAT_FIELD, pilot_tensors
 from lightpage.calibration.waves.wave_fit import WaveFit
+from lightpage.codec.page_codec import PageCodec
 from lightpage.device.state import Device
 from lightpage.errors import BundleError, CalibrationError, FrameError, FramesDisagreeError, InvalidInputError
 from lightpage.export import from_calibration, proof
 from lightpage.export.estimated_device import check_counts
 from lightpage.export.from_calibration import export_calibration
 from lightpage.metrics.measures import measure
+from lightpage.page.correction import wrapped
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import random_symbols
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
+from lightpage.runtime.archives.recordings import coded_pages
+from lightpage.runtime.archives.recordings.coded_pages import FIRST_CODE_MARGIN, SeenPages, choose_code
+from lightpage.runtime.archives.recordings.evaluation import unseen_pages
 from lightpage.runtime.archives.run.job import Job
 from lightpage.runtime.archives.run.task import Choices, NamedBundle, Operation
 from lightpage.runtime.client.client import LightpageClient
@@ -38,7 +43,7 @@ from lightpage.runtime.model.execution.estimator_graph import EstimatorGraph
 from lightpage.runtime.model.execution.session import open_session
 from lightpage.runtime.model.execution.twin import OnnxTwin
 from lightpage.runtime.recalibration.known_pages import KnownPages
-from lightpage.runtime.recalibration.noise import MOST_STEPS, KnownPhases
+from lightpage.runtime.recalibration.noise import MOST_STEPS, KnownPhases, measured_noise
 from lightpage.runtime.recalibration.recalibration import recalibrate
 from lightpage.runtime.recalibration.refit import refit
 from lightpage.runtime.service.assembly import assembled
@@ -211,6 +216,44 @@ def test_a_page_whose_pilots_are_not_the_devices_agrees_with_its_calibration(
         (page,) = known_pages(recording, PROFILE, USED[:1])
     known = KnownPhases(page.pair, np.angle(page.symbols))
     check_counts(graph.with_table(pilot_tensors(others)), known, mask, "page 0")
+
+
+def test_an_error_that_repeats_at_each_symbol_becomes_a_flat_field(bundle: Path, small_device: list[str]) -> None:
+    graph = Decoder.load(bundle, 1).graph
+    assert isinstance(graph, EstimatorGraph)
+    mask = Bundle.open(bundle).pilot_mask
+    pattern = np.random.default_rng(0).normal(0, 0.05, PROFILE.page_shape)
+    with Recording.open(small_device[3]) as recording:
+        known = [KnownPhases(page.pair, np.angle(page.symbols)) for page in known_pages(recording, PROFILE, (0, 1, 2))]
+    shifted = [page._replace(phases=page.phases - pattern) for page in known]
+    usual, repeated = (measured_noise(graph, pages, mask, 1.0, STEPS) for pages in (known[:2], shifted[:2]))
+    assert not usual[FLAT_FIELD].any()
+    assert np.corrcoef(repeated[FLAT_FIELD].ravel(), pattern.ravel())[0, 1] > 0.9
+    errors = []
+    for table in ({}, repeated):
+        (phase,) = graph.with_table(table).run(["phase"], shifted[2].feeds(mask))
+        errors.append(wrapped(phase - shifted[2].phases)[~mask].std())
+    assert errors[1] < 0.6 * errors[0]
+
+
+def test_the_pages_of_a_calibration_are_enough_for_a_first_code(
+    bundle: Path, small_device: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decoder = Decoder.load(bundle, 1)
+    with Recording.open(small_device[3]) as recording:
+        unseen = [page for page, _ in unseen_pages(decoder, recording, tracker_for(decoder), "decode", [])]
+        known = SeenPages.of(
+            decoder, recording, unseen_pages(decoder, recording, tracker_for(decoder), "", [], seen=True)
+        )
+        own = unseen_pages
+        monkeypatch.setattr(
+            coded_pages, "unseen_pages", lambda *given, seen=False: own(*given, seen=seen) if seen else iter(())
+        )
+        choice, _ = choose_code(decoder, recording, tracker_for(decoder))
+    assert len(known.errors) == len(USED)
+    assert np.mean(known.concentrations) == pytest.approx(np.mean([page.concentration for page in unseen]), rel=0.1)
+    assert choice.user_bytes == PageCodec(choice.code, decoder.bundle.pilot_mask).user_bytes > 100
+    assert choice.deviation == pytest.approx(FIRST_CODE_MARGIN * choice.information / 3.09, rel=0.01)
 
 
 @pytest.mark.parametrize("steps", [0, MOST_STEPS + 1])

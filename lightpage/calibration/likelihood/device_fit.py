@@ -33,7 +33,12 @@ from lightpage.calibration.likelihood.measure import light_table
 from lightpage.calibration.likelihood.statistics import Statistics
 from lightpage.calibration.likelihood.table import count_tensors
 from lightpage.calibration.parameters import SEEN_BY_CAMERAS, STEPS
-from lightpage.calibration.sampling_table import SamplingTable, cameras_apart, registration_orientations
+from lightpage.calibration.sampling_table import (
+    SamplingTable,
+    cameras_apart,
+    moved_cameras,
+    registration_orientations,
+)
 from lightpage.calibration.waves.wave_fit import inverse_of_information
 from lightpage.calibration.waves.wave_model import ILLUMINATIONS, LaunchConditions
 from lightpage.device.profile import Profile
@@ -145,11 +150,12 @@ class DeviceFit:
         return replace(current, goodness=goodness), statistics
 
     def _goodness(self, registered: Registered, conditions: LaunchConditions, page: FittedPage) -> Goodness:
-        """Judge a registration by the light of its first page, with its nuisance parameters in `page`."""
+        """Judge a registration by the light of its first page, moved by the gain and the shift of `page`."""
         illumination = conditions.illumination
         launched = conditions._replace(illumination=illumination * (page.gain * abs(illumination[0]) / illumination[0]))
         known = self._pages[0]
-        return measure_goodness(self._twin, self._device(registered), launched, known.pair, known.symbols)
+        moved = replace(registered, parameters=moved_cameras(registered.parameters, page.nuisance[SHIFT]))
+        return measure_goodness(self._twin, self._device(moved), launched, known.pair, known.symbols)
 
     def _device(self, registered: Registered) -> CalibratedDevice:
         return CalibratedDevice(
@@ -167,8 +173,12 @@ class DeviceFit:
         rounds: float,
         nuisances: list[Real] | None = None,
     ) -> tuple[KnownPageFit, Statistics]:
-        """Measure the statistics of the pages' counts after so many finished `rounds`, and fit unknown `nuisances`."""
-        table = light_table(self._twin, self._device(registered), conditions)
+        """Measure the statistics of the pages' counts after so many finished `rounds`.
+
+        The nuisance parameters of the pages are fitted if they are not given.
+        """
+        device = self._device(registered)
+        table = light_table(self._twin, device, conditions, self._likelihood.apart_inputs(device))
         fit = KnownPageFit(self._likelihood, table, self._pages, registered.modulation, nuisances)
         share = 1 - _LINEARISED if rounds else 0.0
         statistics = fit.statistics(conditions, lambda done: self._progress((rounds + share * done) / _ROUNDS))
@@ -189,7 +199,7 @@ class DeviceFit:
             *(self._parameter_step(fit.table, registered.parameters, index) for index in of_light),
             *_other_steps(fit.table, registered.quadrature_phase, conditions.blur),
         ]
-        evaluations = [fit.evaluate(page) for page in fit.pages]
+        evaluations = fit.evaluations
         columns = self._by_steps(fit, evaluations, steps, round_number)
         parameters = np.append(of_light, of_cameras)
         common = len(columns) + len(of_cameras)

@@ -22,13 +22,15 @@ class FlatField(NamedTuple):
     by_others: Real
 
 
-def flat_field(errors: Real) -> FlatField:
+def flat_field(errors: Real, variance: Real) -> FlatField:
     """Estimate the phase error that repeats at each symbol (empirical Bayes, as of normal errors).
 
-    The variance of the mean over pages shows how much of the error repeats. By that the mean is shrunk.
+    The mean over pages is shrunk by the share of its variance that repeats. The variance that repeats is one for all
+    symbols. The pages show it, most of all the symbols that are read well.
 
     Args:
         errors: estimated phases minus known ones, radians [K, ny, nx].
+        variance: expected squares of a symbol's errors, rad^2 [ny, nx].
 
     Returns:
         The flat field; zero where one page alone cannot show what repeats, or nothing does.
@@ -37,11 +39,12 @@ def flat_field(errors: Real) -> FlatField:
     mean = errors.mean(axis=0)
     if count < 2:
         return FlatField(np.zeros_like(mean), np.zeros_like(errors))
-    total = float(np.mean(errors**2))
-    repeated = max(0.0, (count * float(np.mean(mean**2)) - total) / (count - 1))
+    products = (count * mean**2 - np.mean(errors**2, axis=0)) / (count - 1)  # mean over the pairs of pages
+    repeated = max(0.0, float(np.average(products, weights=variance**-2)))
+    noise = np.maximum(variance - repeated, 0)
 
-    def shrinkage(pages: int) -> float:
-        return repeated / max(repeated + (total - repeated) / pages, np.finfo(np.float64).tiny)
+    def shrinkage(pages: int) -> Real:
+        return np.asarray(repeated / np.maximum(repeated + noise / pages, np.finfo(np.float64).tiny))
 
     others = (count * mean - errors) / (count - 1)
     return FlatField(shrinkage(count) * mean, shrinkage(count - 1) * others)

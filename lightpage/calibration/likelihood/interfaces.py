@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.recording.frame_pair import FramePair
 
@@ -64,6 +65,10 @@ def at_places(planes: NDArray[np.float32], places: NDArray[np.intp]) -> Real:
 
 class PageLikelihood(Protocol):
     """Log-likelihood of the phases of a page of one device."""
+
+    def apart_inputs(self, device: CalibratedDevice) -> tuple[str, ...]:
+        """Return the names of the tensors of cameras that stand apart which it takes for a device."""
+        ...
 
     def __call__(self, pair: FramePair, table: SamplingTable, phases: Real, nuisance: Real) -> Derivatives:
         """Evaluate the derivatives.

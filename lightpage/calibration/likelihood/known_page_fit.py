@@ -85,6 +85,7 @@ class KnownPageFit:
         likelihood: as given.
         table: tensors that the likelihood is evaluated with. A fit adds those of the counts' statistics.
         pages: known pages with their nuisance parameters.
+        evaluations: evaluations of the pages with the statistics that were measured last.
     """
 
     def __init__(
@@ -98,6 +99,7 @@ class KnownPageFit:
         self.likelihood = likelihood
         self.table: SamplingTable = dict(table) | _neutral_count_tensors()
         self._known = nuisances is not None
+        self.evaluations: list[Derivatives] = []
         self.pages = [
             FittedPage(page.pair, np.angle(page.light(modulation)), nuisance)
             for page, nuisance in zip(pages, nuisances or [np.array(_UNIT_GAIN)] * len(pages), strict=True)
@@ -124,8 +126,8 @@ class KnownPageFit:
         self.table |= count_tensors(cameras, 1.0)
         score_powers: list[float] = []
         curvatures: list[float] = []
-        for page in self.pages:
-            current = self.evaluate(page)
+        self.evaluations = [self.evaluate(page) for page in self.pages]
+        for page, current in zip(self.pages, self.evaluations, strict=True):
             score_powers.append(float(np.mean(current.by_phase**2)))
             probe = np.random.default_rng(0).choice([-1.0, 1.0], page.phases.shape)
             curvatures.append(float(np.mean(probe * self.hessian_product(page, current, probe))))
@@ -191,11 +193,13 @@ class KnownPageFit:
         return np.asarray(current.stride * jacobian.reshape(len(jacobian), -1) @ score.ravel())
 
     def deviance(self, statistics: Statistics) -> float:
-        """Mean of -2 times the log-likelihood of the pages' counts with given statistics, up to a constant."""
+        """Mean of -2 times the log-likelihood of the pages' counts with given statistics, up to a constant.
+
+        The counts are those of `evaluations`.
+        """
         tensors = count_tensors(statistics.cameras, 1.0)
         total = 0.0
-        for page in self.pages:
-            current = self.evaluate(page)
+        for current in self.evaluations:
             by_score, _, information, score_power = np.moveaxis(_count_weights(tensors, current), 1, 0)
             score = _score(tensors, current)
             total += float(np.mean(score**2 / score_power + np.log(information / by_score**2)))

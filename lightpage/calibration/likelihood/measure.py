@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from lightpage.calibration.calibrate import KnownPage
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.interfaces import Twin
@@ -11,26 +13,31 @@ from lightpage.calibration.likelihood.information import measured_information
 from lightpage.calibration.likelihood.interfaces import PageLikelihood, ProgressCallback
 from lightpage.calibration.likelihood.known_page_fit import KnownPageFit
 from lightpage.calibration.likelihood.statistics import Statistics
-from lightpage.calibration.likelihood.table import launch_tensors
+from lightpage.calibration.likelihood.table import FLAT_FIELD, launch_tensors
 from lightpage.calibration.sampling_table import APART, SamplingTable, sampling_table
 from lightpage.calibration.waves.wave_model import LaunchConditions
 
 
-def light_table(twin: Twin, device: CalibratedDevice, conditions: LaunchConditions) -> SamplingTable:
-    """Collect the tensors of a device's geometry, references and launched light.
+def light_table(
+    twin: Twin, device: CalibratedDevice, conditions: LaunchConditions, apart: tuple[str, ...] | None = None
+) -> SamplingTable:
+    """Collect the tensors of a device's geometry, references and launched light, without a flat field.
 
     Args:
         twin: ray tracer of the nominal device.
         device: calibrated device.
         conditions: illumination and blur of its pages.
+        apart: names of the tensors of cameras that stand apart; those that the device needs if left out.
     """
+    apart = device.apart_inputs if apart is None else apart
     traced = sampling_table(twin, device.parameters, device.quadrature_phase_rad, device.profile)
-    excluded = {"place_gradients", "phases", *APART} - {*device.apart_inputs}
+    excluded = {"place_gradients", "phases", *APART} - {*apart}
     return {
         "reference_in_phase": device.references.in_phase,
         "reference_quadrature": device.references.quadrature,
         **{name: value for name, value in traced.items() if name not in excluded},
         **launch_tensors(device.profile, device.parameters, conditions, device.modulation),
+        FLAT_FIELD: np.zeros(device.profile.page_shape, np.float32),
     }
 
 
@@ -51,7 +58,7 @@ def estimator_table(
         statistics: statistics of the device.
         progress: called with the finished share of the work.
     """
-    table = light_table(twin, device, statistics.conditions)
+    table = light_table(twin, device, statistics.conditions, likelihood.apart_inputs(device))
     fit = KnownPageFit(likelihood, table, pages, device.modulation)
     fit.fit_gains(statistics)
     return {**table, **measured_information(fit, progress)}

@@ -50,15 +50,14 @@ def launch_tensors(
         modulation: light of the modulator at its levels.
 
     Returns:
-        blur []; illumination [2, 6], without its phase; flat_field [ny, nx], zero; amplitude_series [13] and
-        slope_power [], see `lightpage.train.models.likelihood.modulator`; point_spread [7].
+        blur []; illumination [2, 6], without its phase; amplitude_series [13] and slope_power [], see
+        `lightpage.train.models.likelihood.modulator`; point_spread [7].
     """
     coefficients = conditions.illumination * np.exp(-1j * np.angle(conditions.illumination[0]))
     series = amplitude_series(modulation)
     return {
         "blur": np.array(conditions.blur, np.float32),
         "illumination": np.stack([coefficients.real, coefficients.imag]).astype(np.float32),
-        FLAT_FIELD: np.zeros(profile.page_shape, np.float32),
         "amplitude_series": series,
         "slope_power": slope_power(series, modulation),
         "point_spread": point_spread(profile, parameters, conditions.blur),

@@ -3,24 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lightpage.codec.choose import HEADROOM, Choice, DrawnPage, Drift, choose
+from lightpage.codec.choose import FEWEST_PAGES, HEADROOM, Choice, DrawnPage, Drift, choose
 from lightpage.metrics.information import achievable_rate
 from lightpage.page.levels import Levels
 from lightpage.page.pilots import Pilots, remove_piston
 from lightpage.page.symbols import symbol_phases
-from lightpage.progress import warn
+from lightpage.progress import note, warn
 from lightpage.recording.reader import Recording
-from lightpage.runtime.archives.recordings.evaluation import check_recording, check_symbols, pilots_of, unseen_pages
+from lightpage.runtime.archives.recordings.evaluation import (
+    check_recording,
+    check_symbols,
+    pilots_of,
+    unseen_pages,
+)
 from lightpage.runtime.archives.recordings.refused import RefusedPage, refusal
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.page import DecodedPage
 from lightpage.runtime.model.decoding.tracking import Tracker
+from lightpage.words import counted
 
+FIRST_CODE_MARGIN = 0.03
+"""Share of a page's information that a code keeps in reserve if it is chosen before enough pages were read: pages
+differ, and a device drifts from its calibration."""
+_DRAWN_PAGES = 8
+"""Pages that are drawn by the concentrations of known ones."""
 AIR_LEVELS = 256
 """Level count of the AIR: fine enough that it does not bound what a phase carries."""
 
@@ -66,6 +77,18 @@ class SeenPages:
         errors, concentrations = zip(*read, strict=True) if read else ((), ())
         return cls(decoder, pilots_of(decoder, recording), errors, concentrations)
 
+    def with_pages_of(self, other: SeenPages) -> SeenPages:
+        """Return these pages and those of another collection of the same decoder."""
+        errors = [*self.errors, *other.errors]
+        return replace(self, errors=errors, concentrations=[*self.concentrations, *other.concentrations])
+
+    def drawn_by_concentrations(self, seed: int = 0) -> SeenPages:
+        """Draw pages whose phases have the errors that the concentrations of these pages promise (von Mises)."""
+        rng = np.random.default_rng(seed)
+        concentrations = [self.concentrations[number % len(self.concentrations)] for number in range(_DRAWN_PAGES)]
+        errors = [rng.vonmises(0.0, kappa).astype(np.float32) for kappa in concentrations]
+        return replace(self, errors=errors, concentrations=concentrations)
+
     @property
     def air_bits(self) -> float:
         """AIR of the pages, bits a data symbol; 1 where there are none."""
@@ -94,6 +117,10 @@ def choose_code(
 ) -> tuple[Choice, list[Choice]]:
     """Choose a code by the pages of a recording that the bundle has not seen.
 
+    Where the recording has too few, and the bundle reads by maximum likelihood, the code is chosen by the
+    concentrations of all pages, those of the calibration included. They follow from the Fisher information.
+    `FIRST_CODE_MARGIN` is kept in reserve.
+
     Args:
         decoder: decoder of the device.
         recording: recording with known symbols.
@@ -108,8 +135,19 @@ def choose_code(
     check_symbols(recording, "choose a code by")
     refused: list[RefusedPage] = []
     # a page that is lost to the optics is lost to every code
-    seen = SeenPages.of(decoder, recording, unseen_pages(decoder, recording, tracker, "choose a code", refused))
+    unseen = SeenPages.of(decoder, recording, unseen_pages(decoder, recording, tracker, "choose a code", refused))
     if refused:
         lost = refusal(f"recording {recording.path}", refused, recording.pages)
         warn(f"{lost.subject}: {lost.got}; they do not count")
-    return choose(seen.draw, seen.air_bits, seen.mask, headroom, drift=drift)
+    if len(unseen.errors) >= FEWEST_PAGES or refused or not decoder.bundle.is_estimator:
+        return choose(unseen.draw, unseen.air_bits, unseen.mask, headroom, drift=drift)
+    calibrated = unseen_pages(decoder, recording, tracker.anew(), "choose a first code", refused, seen=True)
+    pages = SeenPages.of(decoder, recording, calibrated).with_pages_of(unseen)
+    if not pages.errors:
+        return choose(unseen.draw, unseen.air_bits, unseen.mask, headroom, drift=drift)
+    note(
+        f"code: chosen by the Fisher information of {counted(len(pages.errors), 'page')}, with {FIRST_CODE_MARGIN:.0%} "
+        f"in reserve; {FEWEST_PAGES} pages that the calibration has not seen allow a better one (lightpage code)"
+    )
+    drawn = pages.drawn_by_concentrations()
+    return choose(drawn.draw, drawn.air_bits, drawn.mask, headroom, drift=drift, margin=FIRST_CODE_MARGIN)

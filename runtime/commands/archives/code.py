@@ -125,7 +125,7 @@ def _drifted_reading(decoder: Decoder, recording: Recording, needed: bool) -> Dr
     """Return a reader of pages as of a drifted device; None where no geometry can be moved, unless it is needed."""
     try:
         return DriftedReading(decoder, recording)
-    except (BundleError, CalibrationError) as error:
+    except (BundleError, CalibrationError, InvalidInputError) as error:
         if needed:
             raise
         note(f"drift: not measured, since {error}")

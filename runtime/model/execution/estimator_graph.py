@@ -115,6 +115,10 @@ class EstimatorGraph:
             self._first = like._first
             self._early = like._early
             self._step = like._step
+        if like is not None and _same_but_noise(self.table, like.table):
+            self._constants = like._constants
+            self._bound = like._bound
+            return
         names = [node.name for node in self._operators.get_outputs()]
         feeds = {node.name: self.value(node.name) for node in self._operators.get_inputs()}
         with running(subject):
@@ -178,13 +182,32 @@ class EstimatorGraph:
             steps: number of steps; `self.steps` if left out.
         """
         steps = self.steps if steps is None else steps
-        noise = self.value(NOISE)
         state = self.first_estimate(feeds)
-        for number in range(steps):
-            wanted = (*ESTIMATE_OUTPUTS, CHI_SQUARE) if number == steps - 1 else ESTIMATE
-            session = self._early if number < EARLY_STEPS else self._step
-            state |= self._run_step(session, state, noise[number + 1], feeds, wanted)
+        for number in range(1, steps + 1):
+            wanted = (*ESTIMATE_OUTPUTS, CHI_SQUARE) if number == steps else ESTIMATE
+            state = self.step(state, feeds, number, wanted)
         return [state[name] for name in outputs]
+
+    def step(
+        self,
+        state: Mapping[str, NDArray[Any]],
+        feeds: Mapping[str, NDArray[Any]],
+        number: int,
+        outputs: Sequence[str] = ESTIMATE,
+    ) -> dict[str, NDArray[Any]]:
+        """Compute a step of a page.
+
+        Args:
+            state: outputs of the first estimate and of the steps before, by name.
+            feeds: see `run`.
+            number: number of the step, 1 or more.
+            outputs: names from `STEP_OUTPUTS`; the next step needs those of `ESTIMATE`.
+
+        Returns:
+            The state after the step.
+        """
+        session = self._early if number <= EARLY_STEPS else self._step
+        return {**state, **self._run_step(session, state, self.value(NOISE)[number], feeds, outputs)}
 
     def run_whole(self, outputs: Sequence[str], feeds: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
         """Estimate a page with all steps of the bundle, whatever `self.steps` is; see `run`."""
@@ -251,6 +274,12 @@ class EstimatorGraph:
         if missing := inputs - constants.keys() - {*_FRAMES, *ESTIMATE_INPUTS.values(), *PAGE, NOISE}:
             raise BundleError(self._subject, f"graphs that want {', '.join(sorted(missing))}", "inputs of the table")
         return BoundSession(session, self.provider, constants, self._subject)
+
+
+def _same_but_noise(one: SamplingTable, other: SamplingTable) -> bool:
+    """Return whether two tables hold the same arrays, apart from the noise, from which no constant follows."""
+    names = (one.keys() | other.keys()) - {NOISE}
+    return all(one.get(name) is other.get(name) for name in names)
 
 
 def most_steps(ports: Mapping[str, Port], subject: str) -> int:

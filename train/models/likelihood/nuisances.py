@@ -30,30 +30,30 @@ class PageNuisances(nn.Module):
     def __init__(self, profile: Profile, geometry: WaveGeometry, cells: tuple[int, int], grid: FieldGrid) -> None:
         super().__init__()
         up, across = ((np.arange(1, count) / count - 0.5) * geometry.pipe_width_m for count in cells)
-        facet_x, facet_y = on_facet(couplings(geometry), across, up[:, None])
         radians = 2 * np.pi * profile.image_pixel_m / (geometry.wavelength_m * geometry.focal_length_m)
+        to_facet = couplings(geometry)
+        by_across = np.stack(np.broadcast_arrays(*on_facet(to_facet, across, np.zeros(1))))
+        by_up = np.stack(np.broadcast_arrays(*on_facet(to_facet, np.zeros(1), up)))
         self.x: Tensor
         self.y: Tensor
-        self.ramp_x: Tensor
-        self.ramp_y: Tensor
-        shape = len(up), len(across)
+        self.ramps_across: Tensor
+        self.ramps_up: Tensor
         for name, value in {
             "x": grid.x_m / (profile.page_width_m / 2),
             "y": grid.y_m / (profile.page_height_m / 2),
-            "ramp_x": np.broadcast_to(-radians * facet_x, shape),
-            "ramp_y": np.broadcast_to(-radians * facet_y, shape),
+            "ramps_across": -radians * by_across,
+            "ramps_up": -radians * by_up,
         }.items():
             self.register_buffer(name, torch.from_numpy(np.array(value)).float(), persistent=False)
 
     def at_exit(self, nuisance: Tensor) -> Parts:
         """Factor of gain and shift on the light of the exit facet, [fy, fx]."""
-        ramp = phasor(self.ramp_x * nuisance[4] + self.ramp_y * nuisance[5])
-        return multiply((nuisance[0], nuisance[1]), ramp)
+        across, up = phasor(nuisance[4:] @ self.ramps_across), phasor(nuisance[4:] @ self.ramps_up)
+        return _outer(multiply((nuisance[0], nuisance[1]), across), up)
 
     def tilt(self, nuisance: Tensor, every: int = 1) -> Parts:
         """Phasor of the tilt on every so many samples of the common grid, [Gy, Gx]."""
-        along, down = phasor(nuisance[2] * self.x[::every]), phasor(nuisance[3] * self.y[::every])
-        return multiply((along[0][None, :], along[1][None, :]), (down[0][:, None], down[1][:, None]))
+        return _outer(phasor(nuisance[2] * self.x[::every]), phasor(nuisance[3] * self.y[::every]))
 
     def gradient(self, leaving: Parts, back: Parts, field: Parts, score: Parts, every: int = 1) -> Tensor:
         """Return the derivative of the log-likelihood by the nuisance parameters, [6].
@@ -71,10 +71,16 @@ class PageNuisances(nn.Module):
         y = self.y[::every]
         by_log_gain = (leaving[0] * back[0] + leaving[1] * back[1]).sum()
         turned = _by_phase(leaving, back)
-        shifts = [(turned * ramp).sum() for ramp in (self.ramp_x, self.ramp_y)]
+        along_up, along_across = turned.sum(1), turned.sum(0)
+        shifts = self.ramps_across @ along_across + self.ramps_up @ along_up
         at_camera = _by_phase(field, score)
         tilts = [at_camera.sum(0) @ x, (at_camera @ torch.ones_like(x)) @ y]
-        return torch.stack([by_log_gain, turned.sum(), *tilts, *shifts])
+        return torch.cat([torch.stack([by_log_gain, along_up.sum(), *tilts]), shifts])
+
+
+def _outer(across: Parts, up: Parts) -> Parts:
+    """Product of phasors along either axis, [n] and [m], over a plane, [m, n]."""
+    return multiply((across[0][None, :], across[1][None, :]), (up[0][:, None], up[1][:, None]))
 
 
 def _by_phase(light: Parts, score: Parts) -> Tensor:

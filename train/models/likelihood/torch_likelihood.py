@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.likelihood.interfaces import Derivatives, Real, at_places, chosen_evenly
 from lightpage.calibration.likelihood.table import MEASUREMENT_INPUTS, known_p
 from lightpage.calibration.sampling_table import APART, SamplingTable
@@ -47,6 +48,10 @@ class TorchLikelihood:
         self._operators: tuple[list[bytes], Operators] | None = None
         self._measured_by: list[bytes] = []
         self._pages: dict[int, tuple[FramePair, Page]] = {}
+
+    def apart_inputs(self, device: CalibratedDevice) -> tuple[str, ...]:
+        """See `PageLikelihood`."""
+        return device.apart_inputs
 
     def __call__(self, pair: FramePair, table: SamplingTable, phases: Real, nuisance: Real) -> Derivatives:
         """See `PageLikelihood`."""

@@ -49,7 +49,7 @@ def air(draw: Draw) -> float:
 @pytest.mark.parametrize(
     ("kind", "amount", "setting"),
     [
-        ("angle", 0.2, "geometry.pipe_angle_deg=-0.8"),
+        ("angle", 0.15, "geometry.pipe_angle_deg=-0.75"),
         ("camera", 0.75, "quadrature_camera.shift_x_px=-4.75"),
         ("stroke", 6.0, "slm.stroke_relative_error=-0.06"),
     ],

@@ -102,6 +102,7 @@ class Backwards:
     def __init__(self, likelihood: TorchLikelihood, parameters: np.ndarray) -> None:
         self.likelihood = likelihood
         self.parameters = parameters.astype(np.float32)
+        self.apart_inputs = likelihood.apart_inputs
 
     def __call__(self, pair: FramePair, table: SamplingTable, phases: np.ndarray, nuisance: np.ndarray) -> Derivatives:
         return self.likelihood(pair, table, phases, nuisance)
