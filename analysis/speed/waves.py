@@ -4,10 +4,11 @@
     python -m analysis.speed.waves --set sensor.full_well_e=32 --pages 24 --out D --json F
 
 A device is simulated and calibrated, and its calibration is exported. Further pages are decoded as a service decodes
-them, with each number of steps up to the bundle's. The time of a page is compared with that of the shipped decoder, in
-turns in the same run. With the figures of `python -m analysis.comparison.bound`, the AIR is compared with the bound of
-the light. `--near` spares a large device the search from nominal. `--out` keeps recording, calibration and bundle, so
-that an interrupted command can be repeated to continue.
+them, with each number of steps up to the bundle's. The time of a page is compared with that of the shipped decoder, or
+of the bundle `--beside` (a network of the same profile), in turns in the same run. With the figures of `python -m
+analysis.comparison.bound`, the AIR is compared with the bound of the light. `--near` spares a large device the search
+from nominal. `--out` keeps recording, calibration and bundle, so that an interrupted command can be repeated to
+continue.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ class Row:
         ece: expected calibration error of the confidences.
         over_claim: claimed information minus the AIR, bits a symbol.
         seconds: median time of a page's inference.
-        over_shipped: this time over that of the shipped decoder.
+        over_shipped: this time over that of the shipped decoder, or of the bundle `--beside`.
     """
 
     steps: int
@@ -97,6 +98,7 @@ def _bits(path: Path) -> float:
 @click.option("--seed", default=7000, show_default=True, type=click.IntRange(0), help="Seed of pages and noise.")
 @click.option("--bound", type=click.Path(path_type=Path), help="Figures of `analysis.comparison.bound` of this light.")
 @click.option("--near", type=click.Path(path_type=Path), help="Calibration of the device from which the fit starts.")
+@click.option("--beside", type=click.Path(path_type=Path), help="Bundle whose time is compared; the shipped one.")
 @click.option("--out", type=OutputFolder(), required=True, help="Folder that keeps recording, calibration and bundle.")
 @click.option("--json", "json_path", type=OutputFile(), required=True)
 def main(
@@ -110,6 +112,7 @@ def main(
     seed: int,
     bound: Path | None,
     near: Path | None,
+    beside: Path | None,
     out: Path,
     json_path: Path,
 ) -> None:
@@ -140,7 +143,8 @@ def main(
     decoders = [Decoder.load(bundle, steps=steps) for steps in range(1, most + 1)]
     rows = []
     with Recording.open(recording) as file:
-        shipped, *seconds = timed([Decoder.load(bundle_path(DEFAULT)), *decoders], file.frames(CALIBRATED))
+        compared = Decoder.load(bundle_path(DEFAULT) if beside is None else beside)
+        shipped, *seconds = timed([compared, *decoders], file.frames(CALIBRATED))
         timed_decoders = zip(track(decoders, "decode", unit="number of steps"), seconds, strict=True)
         for steps, (decoder, duration) in enumerate(timed_decoders, 1):
             figures = evaluate(decoder, file, tracker_for(decoder)).figures
@@ -161,7 +165,7 @@ def main(
         of_bound = "" if row.over_bound is None else f", {row.over_bound:.4f} of the bound"
         click.echo(
             f"{row.steps} steps: AIR {row.air:.4f}{of_bound}; over-claim {row.over_claim:+.3f}, ECE {row.ece:.4f}; "
-            f"{1000 * row.seconds:.0f} ms, {row.over_shipped:.2f} of the shipped decoder's"
+            f"{1000 * row.seconds:.0f} ms, {row.over_shipped:.2f} of the other decoder's"
         )
     write_figures(json_path, {"asked": asked, "bound": limit, "rows": [asdict(row) for row in rows]}, asked=asked)
 
