@@ -23,7 +23,7 @@ from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import pilot_mask
 from lightpage.progress import Progress, warn
 from lightpage.recording.frame_pair import FramePair
-from lightpage.recording.layout import narrow
+from lightpage.recording.layout import narrow, page_hashes
 from lightpage.recording.pixels.blemishes import UNIT_GAIN, Blemishes
 from lightpage.recording.reader import Recording
 from lightpage.runtime.model.execution.estimator_graph import (
@@ -213,7 +213,7 @@ def calibrated_pages(calibration: Calibration, recording: Recording) -> list[int
         CalibrationError: the recording has none of the calibration's pages.
     """
     wanted = set(calibration.calibrated_pages)
-    known = [page for page in range(recording.pages) if recording.page_hash(page) in wanted]
+    known = [page for page in range(recording.pages) if not wanted.isdisjoint(page_hashes(recording.frames(page)))]
     if not known:
         expected = "the recording that the calibration was made of, or a calibration by pages of this one"
         raise CalibrationError(f"recording {recording.path}", "none of the calibration's pages", expected)

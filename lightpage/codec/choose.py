@@ -92,7 +92,8 @@ class Choice:
         code: parameters of the code.
         user_bytes: user bytes of a page.
         information: mean information of a coded bit.
-        deviation: standard deviation of the information from page to page.
+        deviation: standard deviation of the information from page to page; of pages that do not show it, the one that
+            their margin allows for.
         upper_errors: mean wrong upper numbers of a page.
         kept: information of a coded bit that was to be kept for drift.
         spare: information that the weakest page of a thousand carries beyond the need: `kept`, and what steps of the
