@@ -33,6 +33,7 @@ from lightpage.export.from_calibration import export_calibration
 from lightpage.metrics.provenance import write_figures
 from lightpage.progress import track
 from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.layout import narrow
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.evaluation import evaluate
 from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
@@ -69,11 +70,14 @@ class Row:
     over_shipped: float
 
 
-def timed(decoders: list[Decoder], pair: FramePair) -> list[float]:
-    """Median time of an inference by each decoder, seconds. Decoders take turns; their first inference is not timed."""
+def timed(decoders: list[tuple[Decoder, FramePair]]) -> list[float]:
+    """Median time of an inference by each decoder, of its own frames, seconds.
+
+    Decoders take turns. Their first inference is not timed.
+    """
     seconds: list[list[float]] = [[] for _ in decoders]
     for number in range(_TIMED + 1):
-        for times, decoder in zip(seconds, decoders, strict=True):
+        for times, (decoder, pair) in zip(seconds, decoders, strict=True):
             start = time.perf_counter()
             decoder.infer(pair, doubtful=True)
             if number:
@@ -144,7 +148,9 @@ def main(
     rows = []
     with Recording.open(recording) as file:
         compared = Decoder.load(bundle_path(DEFAULT) if beside is None else beside)
-        shipped, *seconds = timed([compared, *decoders], file.frames(CALIBRATED))
+        pair = narrow(file.frames(CALIBRATED), file.bit_depth)
+        own = compared.bundle.golden.pair  # cameras may have another bit depth
+        shipped, *seconds = timed([(compared, own), *((decoder, pair) for decoder in decoders)])
         timed_decoders = zip(track(decoders, "decode", unit="number of steps"), seconds, strict=True)
         for steps, (decoder, duration) in enumerate(timed_decoders, 1):
             figures = evaluate(decoder, file, tracker_for(decoder)).figures
