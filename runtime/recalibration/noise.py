@@ -24,6 +24,7 @@ from lightpage.runtime.model.execution.estimator_graph import (
     DEVIATION_PRECISION,
     NO_DEVIATIONS,
     NOISE,
+    NUISANCE_COVARIANCE,
     EstimatorGraph,
 )
 from lightpage.waves.grid import symbol_samples
@@ -34,6 +35,8 @@ MOST_STEPS = 6
 """Largest number of Gauss-Newton steps."""
 _LEAST_GAIN_BITS = 0.004
 """Least gain of information for another step, for a flat field, and for the estimation of deviations, bits a symbol."""
+_DAMPING = 0.2
+"""Precision that damped steps of tilt and shift get beside their own, over what the phases take up of it."""
 _LEAST_DIFFERENCE_RAD = 0.01
 """Least difference of two symbols' phases that is one."""
 _UNIT_NOISE = np.array([1, 0], np.float32)
@@ -81,7 +84,8 @@ def measured_noise(
 ) -> SamplingTable:
     """Measure the noise of the first estimate and after each step, the flat field, and the prior of the deviations.
 
-    Deviations of the modulator's samples are estimated only if known pages are read better with them. There is a flat
+    Deviations of the modulator's samples are estimated only if known pages are read better with them. Steps of tilt and
+    shift are damped only if known pages are read better so, as in dim light. There is a flat
     field only if known pages are read better with it: with the one from before, or each with that of the others.
 
     Args:
@@ -93,19 +97,41 @@ def measured_noise(
         earlier_flat_field: flat field of the device before a re-fit, radians [ny, nx].
 
     Returns:
-        `NOISE` [steps + 1, 2] and `DEVIATION_PRECISION` []; `FLAT_FIELD` [ny, nx] where the graph takes one.
+        `NOISE` [steps + 1, 2], `DEVIATION_PRECISION` [] and `NUISANCE_COVARIANCE` [5, 5]; `FLAT_FIELD` [ny, nx] where
+        the graph takes one.
     """
     most = MOST_STEPS if steps is None else steps
     table = {NOISE: np.tile(_UNIT_NOISE, (len(graph.value(NOISE)), 1))} | _without_flat_field(graph, mask)
     known = _KnownPages(graph.with_table(table), pages, mask, earlier_flat_field)
     fixed = known.measured(NO_DEVIATIONS, most, until_no_gain=steps is None)
+    covariance = graph.value(NUISANCE_COVARIANCE)
+    damped_covariance = _damped_covariance(graph)
+    damped_graph = graph.with_table({**table, NUISANCE_COVARIANCE: damped_covariance})
+    damped_pages = _KnownPages(damped_graph, pages, mask, earlier_flat_field)
+    damped = damped_pages.measured(NO_DEVIATIONS, most, until_no_gain=steps is None)
+    if damped.bits >= fixed.bits + _LEAST_GAIN_BITS:
+        known = damped_pages
+        fixed = damped
+        covariance = damped_covariance
     precision = np.array(1 / (prior_scale * fixed.variance), np.float32)
     fitted = known.measured(precision, most, until_no_gain=steps is None)
     if fitted.bits < fixed.bits + _LEAST_GAIN_BITS:
         fitted = fixed
         precision = NO_DEVIATIONS
     flat = {name: fitted.flat_field.astype(np.float32) for name in _without_flat_field(graph, mask)}
-    return {NOISE: fitted.noise, DEVIATION_PRECISION: precision, **flat}
+    return {NOISE: fitted.noise, DEVIATION_PRECISION: precision, NUISANCE_COVARIANCE: covariance, **flat}
+
+
+def _damped_covariance(graph: EstimatorGraph) -> NDArray[np.float32]:
+    """Return the covariance of brightness, tilt and shift with damping (Levenberg), [5, 5].
+
+    In dim light the true Hessian of the phases is less than their Fisher information. Then directions in which the
+    phases take up most of the information would swing from step to step, and further each time.
+    """
+    precision = np.linalg.inv(graph.value(NUISANCE_COVARIANCE).astype(np.float64))
+    responses = graph.value("responses").astype(np.float64)
+    taken_up = np.einsum("kyx,yx->k", responses**2, graph.value("information").astype(np.float64))
+    return np.linalg.inv(precision + np.diag(_DAMPING * taken_up)).astype(np.float32)
 
 
 def _without_flat_field(graph: EstimatorGraph, mask: NDArray[np.bool_]) -> SamplingTable:

@@ -24,6 +24,8 @@ DEVIATION_PRECISION = "deviation_precision"
 """Inverse variance of the deviations of the modulator's samples from the phases of their symbols."""
 NO_DEVIATIONS = np.array(1e12, np.float32)
 """Precision that keeps the deviations at zero."""
+NUISANCE_COVARIANCE = "nuisance_covariance"
+"""Covariance of a page's brightness, tilt and shift after a step."""
 NOISE = "noise"
 """Noise of the first estimate and after each step, one row each."""
 EARLY_STEPS = 1
