@@ -228,7 +228,7 @@ def test_an_error_that_repeats_at_each_symbol_becomes_a_flat_field(bundle: Path,
     pattern = np.random.default_rng(0).normal(0, 0.05, PROFILE.page_shape)
     with Recording.open(small_device[3]) as recording:
         known = [KnownPhases(page.pair, np.angle(page.symbols)) for page in known_pages(recording, PROFILE, (0, 1, 2))]
-    shifted = [page._replace(phases=page.phases - pattern) for page in known]
+    shifted = [KnownPhases(page.pair, page.phases - pattern) for page in known]
     usual, repeated = (measured_noise(graph, pages, mask, 1.0, STEPS) for pages in (known[:2], shifted[:2]))
     assert not usual[FLAT_FIELD].any()
     assert np.corrcoef(repeated[FLAT_FIELD].ravel(), pattern.ravel())[0, 1] > 0.9

@@ -117,6 +117,8 @@ class EstimatorGraph:
             self._first = like._first
             self._early = like._early
             self._step = like._step
+        self._constants: SamplingTable
+        self._bound: dict[Session, BoundSession]
         if like is not None and _same_but_noise(self.table, like.table):
             self._constants = like._constants
             self._bound = like._bound
