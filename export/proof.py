@@ -7,7 +7,7 @@ import shutil
 from datetime import datetime
 from pathlib import Path
 
-from lightpage.errors import BundleError, InvalidInputError, LostPageError
+from lightpage.errors import BundleError, InvalidInputError
 from lightpage.progress import Progress, warn
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.coded_pages import choose_code
@@ -56,7 +56,7 @@ def proven(
                 try:
                     best, _ = choose_code(decoder, pages, tracker_for(decoder))
                     manifest = manifest.model_copy(update={"code": best.code.to_toml()})
-                except (InvalidInputError, LostPageError) as lacking:
+                except InvalidInputError as lacking:
                     warn(f"no code for user bytes: {lacking}")
     finally:
         _remove(partial)

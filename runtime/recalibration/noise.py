@@ -85,8 +85,8 @@ def measured_noise(
     """Measure the noise of the first estimate and after each step, the flat field, and the prior of the deviations.
 
     Deviations of the modulator's samples are estimated only if known pages are read better with them. Steps of tilt and
-    shift are damped only if known pages are read better so, as in dim light. There is a flat
-    field only if known pages are read better with it: with the one from before, or each with that of the others.
+    shift are damped only if known pages are read better so, as in dim light. There is a flat field only if known pages
+    are read better with it: with the one from before, or each with that of the others.
 
     Args:
         graph: graph of the device, with at least `steps` steps, or `MOST_STEPS` if these are left out.
@@ -130,8 +130,8 @@ def _damped_covariance(graph: EstimatorGraph) -> NDArray[np.float32]:
     """
     precision = np.linalg.inv(graph.value(NUISANCE_COVARIANCE).astype(np.float64))
     responses = graph.value("responses").astype(np.float64)
-    taken_up = np.einsum("kyx,yx->k", responses**2, graph.value("information").astype(np.float64))
-    return np.linalg.inv(precision + np.diag(_DAMPING * taken_up)).astype(np.float32)
+    absorbed = np.einsum("kyx,yx->k", responses**2, graph.value("information").astype(np.float64))
+    return np.linalg.inv(precision + np.diag(_DAMPING * absorbed)).astype(np.float32)
 
 
 def _without_flat_field(graph: EstimatorGraph, mask: NDArray[np.bool_]) -> SamplingTable:
@@ -200,7 +200,7 @@ class _KnownPages:
         self._feeds = [page.feeds(mask) for page in pages]
         self._mask = mask
         self._data = ~mask
-        self._nothing = np.zeros((len(pages), *mask.shape))
+        self._no_flat_fields = np.zeros((len(pages), *mask.shape))
         self._earlier = earlier_flat_field
         self._takes_flat_field = FLAT_FIELD in graph.ports
         self._distinct = all(_differ(one, other) for one, other in itertools.combinations(pages, 2))
@@ -244,14 +244,14 @@ class _KnownPages:
 
     def _flat_field(self, errors: _Errors) -> tuple[Real, Real]:
         """Return the flat field [ny, nx] that helps most, and for each page one that it has no part in, [K, ny, nx]."""
-        plain = errors.noise(self._nothing, self._data)
+        plain = errors.noise(self._no_flat_fields, self._data)
         candidates: list[tuple[Real, Real]] = []
         if self._takes_flat_field and self._distinct:
             variance = np.mean(plain[0] / errors.information + plain[1], axis=0)
             candidates.append(flat_field(errors.phases, variance))
         if self._takes_flat_field and self._earlier is not None and self._earlier.any():
-            candidates.append((np.asarray(self._earlier, np.float64), self._nothing + self._earlier))
-        best = self._nothing[0], self._nothing
+            candidates.append((np.asarray(self._earlier, np.float64), self._no_flat_fields + self._earlier))
+        best = self._no_flat_fields[0], self._no_flat_fields
         most = errors.bits(plain, self._data) + _LEAST_GAIN_BITS
         for flat, by_others in candidates:
             bits = errors.bits(errors.noise(by_others, self._data), self._data)

@@ -253,7 +253,7 @@ def test_the_pages_of_a_calibration_are_enough_for_a_first_code(
     with Recording.open(small_device[3]) as recording:
         given = decoder, recording, tracker_for(decoder), "decode", []
         unseen = SeenPages.of(decoder, recording, unseen_pages(*given))
-        calibrated = SeenPages.of(decoder, recording, unseen_pages(*given, seen=True))
+        calibrated = SeenPages.of(decoder, recording, unseen_pages(*given, in_sample=True))
         choice, _ = choose_code(decoder, recording, tracker_for(decoder))
     assert len(calibrated.errors) == len(USED)
     assert calibrated.drawn_by_concentrations().air_bits == pytest.approx(unseen.air_bits, abs=0.1)

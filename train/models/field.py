@@ -283,7 +283,7 @@ class FieldRecovery(nn.Module):
         lit = (seen[0] & seen[1]).to(torch.float32)
         reference = torch.maximum(reference, floor)
         amplitude = torch.sqrt(reference[0])
-        mean = amplitude.mean(1).mean(0)  # ONNX Runtime's mean of ten million elements at once is 0.1% too small
+        mean = amplitude.mean(1).mean(0)  # ONNX Runtime's mean of millions of elements at once is inaccurate
         return References(where, reference, amplitude / mean, lit)
 
     def solve(self, measured: Measured) -> tuple[Tensor, Tensor]:

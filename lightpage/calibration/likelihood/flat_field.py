@@ -11,7 +11,7 @@ Real = NDArray[np.float64]
 
 
 class FlatField(NamedTuple):
-    """Mean phase error of each symbol.
+    """Phase error of each symbol that repeats on all pages.
 
     Attributes:
         phases: of all pages, radians [ny, nx].
@@ -25,8 +25,8 @@ class FlatField(NamedTuple):
 def flat_field(errors: Real, variance: Real) -> FlatField:
     """Estimate the phase error that repeats at each symbol (empirical Bayes, as of normal errors).
 
-    The mean over pages is shrunk by the share of its variance that repeats. The variance that repeats is one for all
-    symbols. The pages show it, most of all the symbols that are read well.
+    The mean over pages is shrunk by the share of its variance that repeats. That variance is the same for all symbols.
+    It is estimated from all pairs of pages, where symbols of small variance weigh most.
 
     Args:
         errors: estimated phases minus known ones, radians [K, ny, nx].

@@ -67,7 +67,7 @@ class PageLikelihood(Protocol):
     """Log-likelihood of the phases of a page of one device."""
 
     def apart_inputs(self, device: CalibratedDevice) -> tuple[str, ...]:
-        """Return the names of the tensors of cameras that stand apart which it takes for a device."""
+        """Return the names of the tensors of cameras in different planes that the likelihood takes for a device."""
         ...
 
     def __call__(self, pair: FramePair, table: SamplingTable, phases: Real, nuisance: Real) -> Derivatives:

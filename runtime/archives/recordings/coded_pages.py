@@ -141,7 +141,7 @@ def choose_code(
         warn(f"{lost.subject}: {lost.got}; they do not count")
     if len(unseen.errors) >= FEWEST_PAGES or refused or not decoder.bundle.is_estimator:
         return choose(unseen.draw, unseen.air_bits, unseen.mask, headroom, drift=drift)
-    calibrated = unseen_pages(decoder, recording, tracker.anew(), "choose a first code", refused, seen=True)
+    calibrated = unseen_pages(decoder, recording, tracker.anew(), "choose a first code", refused, in_sample=True)
     pages = SeenPages.of(decoder, recording, calibrated).with_pages_of(unseen)
     if not pages.errors:
         return choose(unseen.draw, unseen.air_bits, unseen.mask, headroom, drift=drift)

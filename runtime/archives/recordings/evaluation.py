@@ -153,7 +153,7 @@ def decode_unseen(
     symbols: NDArray[np.uint8] | None,
     turn: Turn | None = None,
     *,
-    seen: bool = False,
+    in_sample: bool = False,
 ) -> DecodedPage | None:
     """A page of a recording, decoded by its own pilots; None where its symbols are unknown, or the bundle has seen it.
 
@@ -162,12 +162,12 @@ def decode_unseen(
         mask: places of the pilots, see `pilots_of`.
         frames, symbols: frames and symbols of the page.
         turn: turn of the page.
-        seen: whether pages that the bundle has seen are wanted instead.
+        in_sample: whether pages that the bundle has seen are wanted instead.
 
     Raises:
         InvalidInputError, LostPageError: see `Tracker.decode`.
     """
-    if symbols is None or was_seen(decoder, frames) is not seen:
+    if symbols is None or was_seen(decoder, frames) is not in_sample:
         return None
     pilots = Pilots.of_symbols(mask, symbols, decoder.bundle.levels(recording.levels))
     return tracker.decode(narrow(frames, recording.bit_depth), recording.levels, pilots, turn)
@@ -180,7 +180,7 @@ def unseen_pages(
     what: str,
     refused: list[RefusedPage],
     *more: type[LightpageError],
-    seen: bool = False,
+    in_sample: bool = False,
 ) -> Iterator[tuple[DecodedPage, NDArray[np.uint8]]]:
     """Decode all pages of a recording in their order and yield those that the bundle has not seen, with their symbols.
 
@@ -189,13 +189,13 @@ def unseen_pages(
         what: is being done, for whoever watches.
         refused: takes the pages that could not be decoded, or were not confirmed.
         more: errors that it takes pages for, too.
-        seen: whether the pages that the bundle has seen are yielded instead.
+        in_sample: whether the pages that the bundle has seen are yielded instead.
     """
     losses: tuple[type[LightpageError], ...] = (InvalidInputError, LostPageError, *more)
     mask = pilots_of(decoder, recording)
 
     def decode(page: Shown, frames: FramePair, symbols: Symbols) -> DecodedPage | None:
-        return decode_unseen(decoder, recording, tracker, mask, frames, symbols, page.turn, seen=seen)
+        return decode_unseen(decoder, recording, tracker, mask, frames, symbols, page.turn, in_sample=in_sample)
 
     pages = decoded_ahead(recording, range(recording.pages), lambda: tracker, decoder.batches.largest, decode)
     for index, result in track(pages, what, total=recording.pages):

@@ -48,7 +48,8 @@ class PageNuisances(nn.Module):
 
     def at_exit(self, nuisance: Tensor) -> Parts:
         """Factor of gain and shift on the light of the exit facet, [fy, fx]."""
-        across, up = phasor(nuisance[4:] @ self.ramps_across), phasor(nuisance[4:] @ self.ramps_up)
+        across = phasor(nuisance[4:] @ self.ramps_across)
+        up = phasor(nuisance[4:] @ self.ramps_up)
         return _outer(multiply((nuisance[0], nuisance[1]), across), up)
 
     def tilt(self, nuisance: Tensor, every: int = 1) -> Parts:
@@ -71,7 +72,8 @@ class PageNuisances(nn.Module):
         y = self.y[::every]
         by_log_gain = (leaving[0] * back[0] + leaving[1] * back[1]).sum()
         turned = _by_phase(leaving, back)
-        along_up, along_across = turned.sum(1), turned.sum(0)
+        along_up = turned.sum(1)
+        along_across = turned.sum(0)
         shifts = self.ramps_across @ along_across + self.ramps_up @ along_up
         at_camera = _by_phase(field, score)
         tilts = [at_camera.sum(0) @ x, (at_camera @ torch.ones_like(x)) @ y]
