@@ -38,6 +38,7 @@ from lightpage.page.modulation import DRIFTS, NOMINAL, Modulation
 from lightpage.progress import Progress
 from lightpage.recording.frame_pair import FramePair
 from lightpage.waves.grid import field_grid, symbol_samples
+from lightpage.waves.parallel import in_parallel
 
 Real = NDArray[np.float64]
 SIGNIFICANT = 16.0
@@ -650,23 +651,19 @@ class _Registration:
             samplers: the field, or one camera's light, by the cameras that it is seen through.
         """
         window = search_window(stage.reach_px * self._pixel, stage.step_px * self._pixel)
-        twin, where, light = RememberingTwin(self.twin), self._where(stage), self.pages[0].light(self.modulation)
+        where, light = self._where(stage), self.pages[0].light(self.modulation)
+        samples = max(1, self._samples // 2) if stage.half_rate else self._samples
+
+        def measured(patch: Patch) -> list[list[Measurement]]:
+            twin = RememberingTwin(self.twin)
+            device = self.parameters, self.profile, patch, light, stage.branches, window, samples
+            return [measure(sampler, twin, *device, cameras=cameras) for cameras, sampler in samplers.items()]
+
         found: list[list[Measurement]] = [[] for _ in samplers]
-        for number, patch in enumerate(where):
+        for number, of_patch in enumerate(in_parallel(measured, where)):
             self.tell(number / len(where))
-            for own, (cameras, sampler) in zip(found, samplers.items(), strict=True):
-                own += measure(
-                    sampler,
-                    twin,
-                    self.parameters,
-                    self.profile,
-                    patch,
-                    light,
-                    stage.branches,
-                    window,
-                    samples=max(1, self._samples // 2) if stage.half_rate else self._samples,
-                    cameras=cameras,
-                )
+            for own, measurements in zip(found, of_patch, strict=True):
+                own += measurements
         return found
 
     def _fit(self, stage: _Stage, found: list[Measurement], prior_scale: float | Real = 1.0) -> None:
