@@ -18,6 +18,7 @@ from lightpage.calibration.sampling_table import APART, SamplingTable
 from lightpage.export.graph import FRAME_INPUTS, TABLE_INPUTS, answers
 from lightpage.export.onnx_files import exported, sharing
 from lightpage.export.operators.device_constants import move_device_constants
+from lightpage.runtime.model.bundle.manifest import DECODER
 from lightpage.runtime.model.execution.estimator_graph import (
     EARLY_STEPS,
     ESTIMATE,
@@ -54,6 +55,8 @@ STEP = (
 )
 """Tensors of the table that a step of every device takes."""
 
+_LEAST_SHARED_BYTES = 1_000
+"""Least size of a constant that graphs share."""
 
 OF_DEVICE = ("homodyne", "amplitude_series", "slope_power", "point_spread", "deviation_precision", *APART)
 """Tensors of the table that no page has of its own. What follows from them is computed once for each device."""
@@ -278,7 +281,8 @@ def whole_onnx(files: EstimatorFiles, steps: int, table: SamplingTable) -> bytes
     Returns:
         A serialised model from frames and table to `WholeGraph.outputs`.
     """
-    device, first, early, step = (onnx.ModelProto.FromString(file) for file in files)
+    graphs = files.operators, files.first, files.early, files.step
+    device, first, early, step = map(onnx.ModelProto.FromString, graphs)
     whole = onnx.ModelProto()
     whole.CopyFrom(first)
     for field in ("node", "initializer", "input", "output", "value_info"):
@@ -312,6 +316,22 @@ def whole_onnx(files: EstimatorFiles, steps: int, table: SamplingTable) -> bytes
     _add_inputs_with_defaults(whole, table)
     onnx.checker.check_model(whole)
     return bytes(whole.SerializeToString())
+
+
+def with_constants_of(decoder: bytes, graph: bytes) -> bytes:
+    """Replace constants of a graph that `decoder.onnx` holds too by references to that file.
+
+    Args:
+        decoder: serialised model of `whole_onnx`.
+        graph: serialised graph that it was made of.
+    """
+    model = onnx.ModelProto.FromString(graph)
+    for tensor in model.graph.initializer:
+        place = decoder.find(tensor.raw_data) if len(tensor.raw_data) >= _LEAST_SHARED_BYTES else -1
+        if place >= 0:
+            onnx.external_data_helper.set_external_data(tensor, DECODER, place, len(tensor.raw_data))
+            tensor.ClearField("raw_data")
+    return bytes(model.SerializeToString())
 
 
 def _append(whole: onnx.ModelProto, part: onnx.ModelProto, prefix: str, names: dict[str, str]) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from lightpage.calibration.document import Calibration
 from lightpage.device.profile import Profile
 from lightpage.export.estimated_device import EstimatedDevice, estimated_device
-from lightpage.export.estimator_graphs import WholeGraph, whole_onnx
+from lightpage.export.estimator_graphs import WholeGraph, whole_onnx, with_constants_of
 from lightpage.export.graph import FieldGraph
 from lightpage.export.onnx_files import field_onnx, twin_onnx
 from lightpage.export.parity import check_parity
@@ -22,10 +22,13 @@ from lightpage.recording.reader import Recording
 from lightpage.runtime.model.bundle.bundle import Bundle, npz, write_bundle
 from lightpage.runtime.model.bundle.manifest import (
     DECODER,
-    ESTIMATOR_FILES,
+    EARLY,
     FIELD,
+    FIRST,
     GOLDEN,
+    OPERATORS,
     PILOTS,
+    STEP,
     TWIN,
     Manifest,
     Provenance,
@@ -106,11 +109,15 @@ def _files(estimated: EstimatedDevice, decoder: bytes, golden: bytes) -> dict[st
     device = estimated.device
     mask = estimated.pilot_mask
     own = estimated.pilot_phases
+    graphs = estimated.graphs
     field = FieldGraph(device.profile, REFLECTIONS, device.apart_inputs)
     tensors = {name: np.asarray(estimated.table[name]) for name in field.table_inputs}
     return {
         DECODER: decoder,
-        **dict(zip(ESTIMATOR_FILES, estimated.graphs, strict=True)),
+        OPERATORS: with_constants_of(decoder, graphs.operators),
+        FIRST: with_constants_of(decoder, graphs.first),
+        EARLY: with_constants_of(decoder, graphs.early),
+        STEP: with_constants_of(decoder, graphs.step),
         TWIN: twin_onnx(estimated.twin),
         FIELD: field_onnx(field, estimated.frame_dtype, tensors),
         GOLDEN: golden,

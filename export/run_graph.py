@@ -12,7 +12,7 @@ from lightpage.export.estimator_graphs import WholeGraph
 from lightpage.export.graph import DecoderGraph, Graph, PublishedGraph, published_tensors, table_tensors
 from lightpage.export.parity import torch_answer
 from lightpage.recording.frame_pair import FramePair
-from lightpage.runtime.model.bundle.bundle import in_few_counts, shows_page
+from lightpage.runtime.model.bundle.bundle import in_few_counts, in_few_roots, shows_page
 from lightpage.train.models.twin import RayTwin, TorchTwin
 from lightpage.train.published.trainer import published_decoder
 from lightpage.train.published.training import PublishedChoices
@@ -52,11 +52,13 @@ def golden_of(
         residual: output by which the bundle judges its pages.
     """
     answer = torch_answer(graph, pair, defaults)
-    limit, coarse = _residual_limit(graph, pair, defaults, answer, residual), in_few_counts(pair, bit_depth)
-    to_coarse = torch_answer(graph, coarse, defaults)
-    if limit is not None and not shows_page(float(to_coarse[residual]), limit):
-        return limit, pair, answer
-    return limit, coarse, to_coarse
+    limit = _residual_limit(graph, pair, defaults, answer, residual)
+    for rounded in (in_few_counts, in_few_roots):
+        coarse = rounded(pair, bit_depth)
+        to_coarse = torch_answer(graph, coarse, defaults)
+        if limit is None or shows_page(float(to_coarse[residual]), limit):
+            return limit, coarse, to_coarse
+    return limit, pair, answer
 
 
 def _residual_limit(

@@ -159,6 +159,24 @@ class _Errors(NamedTuple):
         return expected_bits(noise, self.information[:, data].ravel())
 
 
+class _Step(NamedTuple):
+    """Known pages after a step.
+
+    Attributes:
+        errors: errors of their phases.
+        flat_field: flat field that helps most, radians [ny, nx].
+        by_others: for each page a flat field that it has no part in, radians [K, ny, nx].
+        noise: noise with these flat fields, [2].
+        bits: expected information, bits a symbol.
+    """
+
+    errors: _Errors
+    flat_field: Real
+    by_others: Real
+    noise: NDArray[np.float32]
+    bits: float
+
+
 class _Measured(NamedTuple):
     """Measurements on known pages.
 
@@ -215,23 +233,22 @@ class _KnownPages:
         """
         graph = self._graph.with_table({DEVIATION_PRECISION: precision})
         states = [graph.first_estimate(feeds) for feeds in self._feeds]
-        errors: list[_Errors] = []
-        best: _Measured | None = None
+        steps: list[_Step] = []
         for number in range(most + 1):
             if number:
                 states = [graph.step(*each, number) for each in zip(states, self._feeds, strict=True)]
-            errors.append(self._errors([state["p"] for state in states]))
-            flat, by_others = self._flat_field(errors[-1])
-            row = errors[-1].noise(by_others, self._data)
-            bits = errors[-1].bits(row, self._data)
-            if until_no_gain and number > 1 and best is not None and bits < best.bits + _LEAST_GAIN_BITS:
+            errors = self._errors([state["p"] for state in states])
+            flat, by_others = self._flat_field(errors)
+            noise = errors.noise(by_others, self._data)
+            step = _Step(errors, flat, by_others, noise, errors.bits(noise, self._data))
+            if until_no_gain and number > 1 and step.bits < steps[-1].bits + _LEAST_GAIN_BITS:
                 break
-            variance = float(np.median(row[0] / errors[-1].information[:, self._data] + row[1]))
-            noise = np.stack([each.noise(by_others, self._data) for each in errors])
-            best = _Measured(noise, flat, bits, variance)
-            states = [{**state, "p": _with_noise(state["p"], row)} for state in states]
-        assert best is not None
-        return best
+            steps.append(step)
+            states = [{**state, "p": _with_noise(state["p"], noise)} for state in states]
+        last = steps[-1]
+        rows = [*(step.errors.noise(last.by_others, self._data) for step in steps[:-1]), last.noise]
+        variance = float(np.median(last.noise[0] / last.errors.information[:, self._data] + last.noise[1]))
+        return _Measured(np.stack(rows), last.flat_field, last.bits, variance)
 
     def _errors(self, answers: Sequence[NDArray[np.float32]]) -> _Errors:
         """Compare the pages' answers p [2, ny, nx], of unit noise, with the known phases."""

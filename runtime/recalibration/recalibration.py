@@ -18,7 +18,7 @@ from lightpage.errors import CalibrationError, FrameError, RecalibrationRefusedE
 from lightpage.progress import Progress
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import hash_frames
-from lightpage.runtime.model.bundle.bundle import Bundle, in_few_counts, npz, shows_page, write_bundle
+from lightpage.runtime.model.bundle.bundle import Bundle, in_few_counts, in_few_roots, npz, shows_page, write_bundle
 from lightpage.runtime.model.bundle.manifest import GOLDEN, TABLE, Manifest, Provenance, check_version
 from lightpage.runtime.model.decoding.batch_graph import with_proven_batches
 from lightpage.runtime.model.decoding.decoder import Decoder
@@ -181,18 +181,17 @@ def recalibrate(
 def _golden(decoder: Decoder, pair: FramePair) -> tuple[FramePair, NDArray[np.float32]]:
     """The golden page's frames, in few counts where they still show a page, and the answer to them."""
     manifest = decoder.bundle.manifest
-    coarse, answer, limit = (
-        in_few_counts(pair, manifest.camera_bit_depth),
-        decoder.infer(pair, alone=True),
-        manifest.residual_limit,
-    )
-    try:
-        to_coarse = decoder.infer(coarse, alone=True)
-    except FrameError:
-        return pair, answer.p
-    if limit is not None and not shows_page(to_coarse.residual, limit):
-        return pair, answer.p
-    return coarse, to_coarse.p
+    answer = decoder.infer(pair, alone=True)
+    limit = manifest.residual_limit
+    for rounded in (in_few_counts, in_few_roots):
+        coarse = rounded(pair, manifest.camera_bit_depth)
+        try:
+            to_coarse = decoder.infer(coarse, alone=True)
+        except FrameError:
+            continue
+        if limit is None or shows_page(to_coarse.residual, limit):
+            return coarse, to_coarse.p
+    return pair, answer.p
 
 
 def next_version(version: str, taken: Sequence[str] = ()) -> str:

@@ -24,6 +24,7 @@ from lightpage.calibration.likelihood.known_page_fit import (
     GAIN,
     NUISANCES,
     SHIFT,
+    TILT,
     FittedPage,
     KnownPageFit,
     moved_nuisance,
@@ -32,7 +33,7 @@ from lightpage.calibration.likelihood.known_page_fit import (
 from lightpage.calibration.likelihood.measure import light_table
 from lightpage.calibration.likelihood.statistics import Statistics
 from lightpage.calibration.likelihood.table import count_tensors
-from lightpage.calibration.parameters import SEEN_BY_CAMERAS, STEPS
+from lightpage.calibration.parameters import NAMES, SEEN_BY_CAMERAS, STEPS
 from lightpage.calibration.sampling_table import (
     SamplingTable,
     cameras_apart,
@@ -48,6 +49,8 @@ from lightpage.waves.grid import field_grid
 Real = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
+_CAMERA_TILTS = [NAMES.index("camera_tilt_x_rad"), NAMES.index("camera_tilt_y_rad")]
+"""Tilt of the light against the reference, as a page's tilt is."""
 _ROUNDS = 3
 """Largest number of scoring steps."""
 _LEAST_GAIN = 20.0
@@ -150,11 +153,13 @@ class DeviceFit:
         return replace(current, goodness=goodness), statistics
 
     def _goodness(self, registered: Registered, conditions: LaunchConditions, page: FittedPage) -> Goodness:
-        """Judge a registration by the light of its first page, moved by the gain and the shift of `page`."""
+        """Judge a registration by the light of its first page, with the gain, tilt and shift of `page`."""
         illumination = conditions.illumination
         launched = conditions._replace(illumination=illumination * (page.gain * abs(illumination[0]) / illumination[0]))
         known = self._pages[0]
-        moved = replace(registered, parameters=moved_cameras(registered.parameters, page.nuisance[SHIFT]))
+        parameters = moved_cameras(registered.parameters, page.nuisance[SHIFT])
+        parameters[_CAMERA_TILTS] += page.nuisance[TILT]
+        moved = replace(registered, parameters=parameters)
         return measure_goodness(self._twin, self._device(moved), launched, known.pair, known.symbols)
 
     def _device(self, registered: Registered) -> CalibratedDevice:

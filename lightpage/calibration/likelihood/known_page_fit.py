@@ -24,6 +24,8 @@ Real = NDArray[np.float64]
 
 GAIN = slice(0, 2)
 """Real and imaginary part of the gain within a nuisance vector."""
+TILT = slice(2, 4)
+"""Tilt (x, y) within a nuisance vector."""
 SHIFT = slice(4, 6)
 """Shift (x, y) within a nuisance vector."""
 PRIOR_DEVIATIONS = np.array([0.1, 0.1, 0.15, 0.15])

@@ -33,15 +33,22 @@ def fitted_noise(errors: Real, information: Real) -> NDArray[np.float32]:
     relative = information / np.median(information)
     variance = max(float(np.median(errors**2)) / _MEDIAN_CHI2, _LEAST_VARIANCE)
 
-    def loss(logarithms: Real) -> float:
-        concentration = 1 / (np.exp(logarithms[0]) / relative + np.exp(logarithms[1]))
-        log_normalization = np.log(scipy.special.i0e(concentration))
-        return float(np.mean(log_normalization - concentration * (np.cos(errors) - 1)))
+    cosines = np.cos(errors)
+
+    def loss(logarithms: Real) -> tuple[float, Real]:
+        """Mean of the negative log-likelihood up to a constant, and its gradient."""
+        factor, additional = np.exp(logarithms)
+        concentration = 1 / (factor / relative + additional)
+        scaled_bessel = scipy.special.i0e(concentration)
+        values = np.log(scaled_bessel) - concentration * (cosines - 1)
+        by_variance = -(concentration**2) * (scipy.special.i1e(concentration) / scaled_bessel - cosines)
+        gradient = np.array([factor * np.mean(by_variance / relative), additional * np.mean(by_variance)])
+        return float(np.mean(values)), gradient
 
     least = np.log(variance * _LEAST_SHARE)
     bounds = [(least, 3.0)] * 2
     starts = [np.log(variance * np.array(shares)) for shares in ((0.9, 0.1), (0.1, 0.9))]
-    fits = [scipy.optimize.minimize(loss, start, method="Nelder-Mead", bounds=bounds) for start in starts]
+    fits = [scipy.optimize.minimize(loss, start, method="L-BFGS-B", jac=True, bounds=bounds) for start in starts]
     best = np.exp(min(fits, key=lambda fit: float(fit.fun)).x)
     return np.array([best[0] * np.median(information), best[1]], np.float32)
 

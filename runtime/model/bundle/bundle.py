@@ -66,6 +66,8 @@ _COARSE_SHARE = 0.6
 recovered by descent, and to 0.53 by reflections."""
 _COUNTS = 32
 """Counts that are left of a camera's. At 15,000 electrons a step is about four times a bright pixel's own noise."""
+_ROOTS = 16
+"""Values that are left of the roots of a camera's counts. At 15,000 electrons a step is about five times the noise."""
 
 
 @dataclass(frozen=True)
@@ -340,6 +342,24 @@ def in_few_counts(pair: FramePair, bit_depth: int) -> FramePair:
     """
     step = (1 << bit_depth) // _COUNTS
     return FramePair(_coarse(pair.in_phase, step), _coarse(pair.quadrature, step))
+
+
+def in_few_roots(pair: FramePair, bit_depth: int) -> FramePair:
+    """Counts whose roots are rounded to one of 16: the rounding is the same share of each pixel's shot noise.
+
+    Args:
+        pair, bit_depth: see `in_few_counts`.
+
+    Returns:
+        Frames of the same shapes and types. Compressed, they take about a third of the room.
+    """
+    step = np.sqrt(1 << bit_depth) / _ROOTS
+
+    def rounded(frame: NDArray[np.integer[Any]]) -> NDArray[np.integer[Any]]:
+        roots = step * (np.floor(np.sqrt(frame) / step) + 0.5)
+        return np.asarray(np.round(roots**2), dtype=frame.dtype)
+
+    return FramePair(rounded(pair.in_phase), rounded(pair.quadrature))
 
 
 def _coarse(frame: NDArray[np.integer[Any]], step: int) -> NDArray[np.integer[Any]]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property, partial
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +14,7 @@ from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.errors import BundleError, InvalidInputError
 from lightpage.runtime.model.execution.providers import ON_CPU, Provider
 from lightpage.runtime.model.execution.session import BoundSession, Port, Session, open_session, running
-from lightpage.runtime.model.execution.table_graph import GraphFile, HeldTable, check_table
+from lightpage.runtime.model.execution.table_graph import GraphFile, HeldTable, check_table, with_outputs
 
 ESTIMATE = ("p", "nuisance", "deviations")
 """Outputs of the first estimate and of each step that the next step takes."""
@@ -30,7 +32,9 @@ NOISE = "noise"
 """Noise of the first estimate and after each step, one row each."""
 EARLY_STEPS = 1
 """Number of first steps that predict the light coarsely. Later steps correct their errors."""
-DERIVATIVES = ("by_phase", "by_nuisance", "expected")
+EXPECTED = "expected"
+"""Output of a step: expected counts of both cameras at the estimate it was given."""
+DERIVATIVES = ("by_phase", "by_nuisance", EXPECTED)
 """Outputs of a step that belong to the estimate it was given."""
 ESTIMATE_OUTPUTS = ("p", "phase", "concentration", "nuisance", "deviations")
 """Outputs of the first estimate and of each step."""
@@ -49,12 +53,30 @@ class EstimatorFiles(NamedTuple):
         operators: graph from a device's table to the wave operators, which the other graphs take.
         first: graph from frames to the first estimate.
         early, step: graphs from an estimate to the next one, with coarsely and accurately predicted light.
+        constants: contents of files that the graphs share constants with, by name.
     """
 
     operators: bytes
     first: bytes
     early: bytes
     step: bytes
+    constants: Mapping[str, bytes] = MappingProxyType({})
+
+
+class _OpenedOnce:
+    """Session that is opened when it is first needed, for all graphs that share it.
+
+    Args:
+        open_it: opens the session.
+    """
+
+    def __init__(self, open_it: Callable[[], Session]) -> None:
+        self._open_it = open_it
+
+    @cached_property
+    def session(self) -> Session:
+        """The session."""
+        return self._open_it()
 
 
 class EstimatorGraph:
@@ -108,15 +130,25 @@ class EstimatorGraph:
         most = most_steps(self.ports, subject)
         self.steps = most if steps is None else min(steps, most)
         if like is None:
-            self._operators = open_session(files.operators, f"{subject}: operators", threads, once=True)
-            self._first = open_session(files.first, f"{subject}: first estimate", threads, provider=provider)
-            self._early = open_session(files.early, f"{subject}: early step", threads, provider=provider)
-            self._step = open_session(files.step, f"{subject}: step", threads, provider=provider)
+            held = files.constants
+            self._operators = open_session(
+                files.operators, f"{subject}: operators", threads, once=True, constants=held
+            )
+            of_pages = partial(open_session, threads=threads, provider=provider, constants=held)
+            self._first = of_pages(files.first, f"{subject}: first estimate")
+            self._early = of_pages(files.early, f"{subject}: early step")
+            self._step = of_pages(files.step, f"{subject}: step")
+            self._prediction = _OpenedOnce(lambda: of_pages(with_outputs(files.step, [EXPECTED]), f"{subject}: step"))
         else:
             self._operators = like._operators
             self._first = like._first
             self._early = like._early
             self._step = like._step
+            self._prediction = like._prediction
+        if like is None:
+            self._values = {**defaults.defaults(self.ports.keys() - self.table.keys()), **self.table}
+        else:
+            self._values = {**like._values, **self.table}
         self._constants: SamplingTable
         self._bound: dict[Session, BoundSession]
         if like is not None and _same_but_noise(self.table, like.table):
@@ -169,7 +201,7 @@ class EstimatorGraph:
         """
         if name not in self.ports:
             raise InvalidInputError("table", repr(name), f"one of {sorted(self.ports)}")
-        return self.table[name] if name in self.table else self._defaults.default(name)
+        return self._values[name]
 
     def check(self, table: SamplingTable) -> None:
         """Check new tensors of the table; see `check_table`."""
@@ -238,7 +270,12 @@ class EstimatorGraph:
             The outputs by name.
         """
         state = {**page, "p": p, "nuisance": nuisance}
-        return self._run_step(self._step, state, self.value(NOISE)[1], feeds, outputs)
+        session = self._step
+        if [*outputs] == [EXPECTED]:
+            session = self._prediction.session
+            if session not in self._bound:
+                self._bound[session] = self._with_constants(session)
+        return self._run_step(session, state, self.value(NOISE)[1], feeds, outputs)
 
     def first_estimate(self, feeds: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
         """Compute the first estimate of a page.

@@ -38,7 +38,8 @@ def open_graph(
     if bundle.is_estimator:
         with raised_as(BundleError, InvalidInputError, about=f"{bundle.subject}: "):
             check_table(file.table_inputs, bundle.table)
-            files = EstimatorFiles(*(bundle.files[name] for name in ESTIMATOR_FILES))
+            held = {DECODER: bundle.files[DECODER]}
+            files = EstimatorFiles(*(bundle.files[name] for name in ESTIMATOR_FILES), constants=held)
             return EstimatorGraph(files, file, bundle.subject, threads, bundle.table, provider=provider, steps=steps)
     with raised_as(BundleError, InvalidInputError, about=f"{bundle.subject}: "):
         return TableGraph(file, subject, PAGE_INPUTS, threads, bundle.table, provider=provider)

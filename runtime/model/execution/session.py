@@ -83,17 +83,19 @@ def open_session(
     profile: Path | None = None,
     provider: Provider = ON_CPU,
     rounded: bool = False,
+    constants: Mapping[str, bytes] | None = None,
 ) -> Session:
     """Open an ONNX model held in memory.
 
     Args:
-        model: the serialised model; weights in other files are not looked for.
+        model: the serialised model. It may refer to constants in `constants`, but not to files of this machine.
         subject: what it is, for the error, e.g. ``"bundle B: decoder.onnx"``.
         threads: threads for one run on the CPU; by default as many as this process has cores.
         once: whether it will run a single time: then it is not worth while to prepare much.
         profile: beginning of the path of a file in which the runtime notes how long each node takes.
         provider: what it runs on.
         rounded: whether its products may be rounded, as those of a graph for batches.
+        constants: contents of the files that hold constants of the model, by the names that it uses for them.
 
     Raises:
         BundleError: the bytes are no ONNX model that this onnxruntime can run.
@@ -115,6 +117,9 @@ def open_session(
         options.enable_profiling, options.profile_file_prefix = True, str(profile)
     # A model that names an outside file for its weights must not read this machine's files.
     options.add_session_config_entry("session.model_external_initializers_file_folder_path", _NOWHERE)
+    if constants:
+        contents = [*constants.values()]
+        options.add_external_initializers_from_files_in_memory([*constants], contents, [*map(len, contents)])
     check_provider(provider)
     if provider.memory != ON_CPU.memory:
         os.environ.setdefault("NVIDIA_TF32_OVERRIDE", "0")  # TensorRT would round float32, and has no option against it

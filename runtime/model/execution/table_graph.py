@@ -95,15 +95,21 @@ class GraphFile:
         Args:
             name: one of `table_inputs`.
         """
-        graph = pb.Model.FromString(self._model).graph
-        tensor = next(tensor for tensor in graph.initializer if tensor.name == name)
-        port = self.table_inputs[name]
-        dtype = np.dtype(port.dtype)
-        if tensor.raw_data:
-            values = np.frombuffer(tensor.raw_data, dtype.newbyteorder("<")).astype(dtype, copy=False)
-        else:
-            values = np.array(getattr(tensor, _LISTS.get(port.dtype, "int32_data")), dtype)
-        return values.reshape([int(size) for size in tensor.dims])
+        return self.defaults([name])[name]
+
+    def defaults(self, names: Collection[str]) -> dict[str, NDArray[np.generic]]:
+        """Defaults of some table inputs, read-only, by name."""
+        values: dict[str, NDArray[np.generic]] = {}
+        for tensor in pb.Model.FromString(self._model).graph.initializer:
+            if tensor.name not in names:
+                continue
+            dtype = np.dtype(self.table_inputs[tensor.name].dtype)
+            if tensor.raw_data:
+                array = np.frombuffer(tensor.raw_data, dtype.newbyteorder("<")).astype(dtype, copy=False)
+            else:
+                array = np.array(getattr(tensor, _LISTS.get(dtype.name, "int32_data")), dtype)
+            values[tensor.name] = array.reshape([int(size) for size in tensor.dims])
+        return values
 
     def cut(self, table: SamplingTable, fed: Collection[str]) -> CutGraph:
         """The model without table inputs but those `fed`, in two parts.
@@ -156,6 +162,17 @@ def _cut(model: pb.Model, fixed: Collection[str]) -> CutGraph:
     return CutGraph(None if first is None else first.SerializeToString(), model, between, direct)
 
 
+def with_outputs(model: bytes, names: Collection[str]) -> bytes:
+    """Reduce a serialised graph to some of its outputs, and to what they follow from."""
+    reduced = pb.Model.FromString(model)
+    graph = reduced.graph
+    nodes = _needed(list(graph.node), set(names))
+    taken = {name for node in nodes for name in node.input}
+    inputs = [entry for entry in graph.input if entry.name in taken]
+    _keep(reduced, nodes, inputs, [entry for entry in graph.output if entry.name in names])
+    return reduced.SerializeToString()
+
+
 def _needed(nodes: list[pb.Node], names: set[str]) -> list[pb.Node]:
     """Return the nodes among some that tensors follow from, in order."""
     found = []
@@ -196,9 +213,9 @@ class HeldTable:
         self._table = {name: np.asarray(value) for name, value in table.items()}
         self.table_inputs = {name: Port(str(value.dtype), value.shape) for name, value in self._table.items()}
 
-    def default(self, name: str) -> NDArray[np.generic]:
-        """Return a tensor of the table."""
-        return self._table[name]
+    def defaults(self, names: Collection[str]) -> dict[str, NDArray[np.generic]]:
+        """Return some tensors of the table, by name."""
+        return {name: self._table[name] for name in names}
 
 
 def check_table(ports: Mapping[str, Port], table: SamplingTable) -> None:

@@ -19,7 +19,7 @@ from lightpage.recording.exposure import check_light
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.bundle import archive
 from lightpage.runtime.model.bundle.archive import read_files
-from lightpage.runtime.model.bundle.bundle import Bundle, in_few_counts, npz, shows_page, write_bundle
+from lightpage.runtime.model.bundle.bundle import Bundle, in_few_counts, in_few_roots, npz, shows_page, write_bundle
 from lightpage.runtime.model.bundle.manifest import (
     DECODER,
     ESTIMATOR_FILES,
@@ -302,6 +302,18 @@ def test_frames_at_full_scale_and_black_ones_stay_within_a_cameras_counts() -> N
     bright = np.full((4, 6), 4095, np.uint16)
     coarse = in_few_counts(FramePair(bright, np.zeros_like(bright)), 12)
     assert (int(coarse.in_phase.max()), int(coarse.quadrature.max())) == (4095 - 63, 64)
+
+
+@pytest.mark.parametrize("bit_depth", [8, 12])
+def test_few_roots_err_by_a_share_of_the_shot_noise(bit_depth: int) -> None:
+    counts = np.arange(1 << bit_depth).astype(np.uint8 if bit_depth == 8 else np.uint16)[None]
+    few = in_few_roots(FramePair(counts, counts), bit_depth).in_phase
+    assert few.dtype == counts.dtype
+    assert len(np.unique(few)) == 16
+    assert 0 < few[0, -1] < counts[0, -1]
+    bright = counts > counts.max() / 16
+    errors = (few.astype(float) - counts)[bright] / np.sqrt(counts[bright])
+    assert np.abs(errors).max() < 1.2 * np.sqrt(1 << bit_depth) / 16
 
 
 @pytest.mark.parametrize(("coarse", "shows"), [(0.0014, True), (0.0019, False), (float("nan"), False)])
