@@ -217,7 +217,7 @@ def calibrate(
     for stage in _COMPLEX:
         work.complex_field(stage)
     work.estimate_turn()
-    work.waves("relation of the cameras", ("in_phase", "quadrature"))
+    work.waves("relation of the cameras", ("in_phase", "quadrature"), effort="rough")
     best = _best_of_starts(work)
     check_agreement(best.coherences)
     return best
@@ -534,7 +534,9 @@ class _Registration:
         page = self.pages[0]
         return WaveFit(self.twin, self.profile, page.pair, self.references, page.symbols)
 
-    def waves(self, what: str, groups: tuple[str, ...], prior_scale: float | Real = 1.0) -> None:
+    def waves(
+        self, what: str, groups: tuple[str, ...], prior_scale: float | Real = 1.0, effort: Effort | None = None
+    ) -> None:
         """Fit `groups` and the angle between the arms to the waves of the first page."""
         self.begin(what)
         found = self.wave_fit().fit(
@@ -546,7 +548,7 @@ class _Registration:
             self.tell,
             self.modulation,
             self.levels,
-            self.effort,
+            effort or self.effort,
         )
         self.parameters, self.deviations = found.parameters, found.deviations
         self.quadrature_phase, self.quadrature_deviation = found.quadrature_phase, found.quadrature_deviation
