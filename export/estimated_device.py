@@ -13,7 +13,7 @@ from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.document import Calibration
 from lightpage.calibration.known_pages import known_pages, without_blemishes
 from lightpage.calibration.likelihood.measure import estimator_table
-from lightpage.calibration.likelihood.table import PIXEL_GAINS, known_p, pilot_tensors
+from lightpage.calibration.likelihood.table import PIXEL_GAINS, pilot_tensors
 from lightpage.calibration.sampling_table import APART, SamplingTable
 from lightpage.device.profile import Profile
 from lightpage.errors import CalibrationError, InvalidInputError
@@ -21,13 +21,13 @@ from lightpage.export.estimator_graphs import estimator_files
 from lightpage.page.correction import wrapped
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import pilot_mask
-from lightpage.progress import Progress, warn
+from lightpage.progress import Progress
 from lightpage.recording.frame_pair import FramePair
-from lightpage.recording.layout import narrow, page_hashes
+from lightpage.recording.layout import narrow
 from lightpage.recording.pixels.blemishes import UNIT_GAIN, Blemishes
 from lightpage.recording.reader import Recording
+from lightpage.runtime.archives.recordings.new_device import calibrated_pages
 from lightpage.runtime.model.execution.estimator_graph import (
-    CHI_SQUARE,
     DEVIATION_PRECISION,
     NO_DEVIATIONS,
     NOISE,
@@ -35,21 +35,16 @@ from lightpage.runtime.model.execution.estimator_graph import (
     EstimatorGraph,
 )
 from lightpage.runtime.model.execution.table_graph import HeldTable
+from lightpage.runtime.recalibration.estimator import check_counts
 from lightpage.runtime.recalibration.noise import MOST_STEPS, KnownPhases, deviation_prior_scale, measured_noise
 from lightpage.train.models.likelihood.estimator import PhaseEstimator
 from lightpage.train.models.likelihood.torch_likelihood import TorchLikelihood
 from lightpage.train.models.twin import RayTwin, TorchTwin
 from lightpage.train.trainers.whole_run import own_pilots
 
-MOST_PAGES = 4
-"""Largest number of known pages on which information and noise are measured."""
 MOST_THINNED_ERROR = 1.01
 """Largest error of phases with the thinned grid, over that without, for which it is used. On the bench device it is
 1.00 in bright light and 1.02 at 32 electrons."""
-MOST_CHI_SQUARE = 2.0
-"""Largest mean square of a known page's residuals over their variance. It is 1 with the calibration's own references.
-A small device's page has 5.5 with references at 0.9 times the exposure, 11 with mirrored references, and 3.3 with
-references that are shifted by 20 pixels."""
 
 
 @dataclass(frozen=True)
@@ -177,51 +172,6 @@ def _thinned_grid_suffices(
             error = wrapped(torch.atan2(estimate.p[1], estimate.p[0]).numpy().astype(np.float64) - known.phases)
             deviations.append(float(np.median(np.abs(error))))
     return deviations[0] <= MOST_THINNED_ERROR * deviations[1]
-
-
-def check_counts(graph: EstimatorGraph, known: KnownPhases, mask: NDArray[np.bool_], subject: str) -> None:
-    """Check that a known page's counts scatter about the expected counts as the calibration's statistics say.
-
-    Args:
-        graph: graph of the calibrated device.
-        known: page of the calibration.
-        mask: positions of the pilots, bool [ny, nx].
-        subject: name of the page, for the error.
-
-    Raises:
-        CalibrationError: the counts scatter more, as with references other than those of the calibration.
-    """
-    feeds = known.feeds(mask)
-    page = graph.first_estimate(feeds)
-    p = known_p(known.phases)
-    nuisance = page["nuisance"]
-    chi_square = np.inf
-    for _ in range(MOST_STEPS):
-        outputs = graph.derivatives(page, feeds, p, nuisance, ("nuisance", CHI_SQUARE))
-        nuisance = outputs["nuisance"]
-        chi_square = float(outputs[CHI_SQUARE])
-    if not chi_square <= MOST_CHI_SQUARE:
-        got = f"counts that scatter {chi_square:.3g} times as much as the calibration says"
-        expected = f"at most {MOST_CHI_SQUARE:g} times; are these the calibration's references? Or calibrate anew"
-        raise CalibrationError(subject, got, expected)
-
-
-def calibrated_pages(calibration: Calibration, recording: Recording) -> list[int]:
-    """Return the numbers of the last `MOST_PAGES` pages of a recording that belong to a calibration.
-
-    Raises:
-        CalibrationError: the recording has none of the calibration's pages.
-    """
-    wanted = set(calibration.calibrated_pages)
-    known = [page for page in range(recording.pages) if not wanted.isdisjoint(page_hashes(recording.frames(page)))]
-    if not known:
-        expected = "the recording that the calibration was made of, or a calibration by pages of this one"
-        raise CalibrationError(f"recording {recording.path}", "none of the calibration's pages", expected)
-    if len(known) == 1:
-        warn(
-            "statistics of one known page only: with two, bright pages are read better (lightpage calibrate --pages 2)"
-        )
-    return known[-MOST_PAGES:]
 
 
 def _pilots(device: CalibratedDevice, mask: NDArray[np.bool_], own: NDArray[np.float32] | None) -> Pilots:

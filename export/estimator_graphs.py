@@ -264,10 +264,14 @@ def estimator_files(
     early = step_model(backward, coarse=True)
     step = step_model(everything, coarse=False)
     move_device_constants(device, {"first": first, "early": early, "step": step}, {*names, *OF_DEVICE})
-    models = [device, first, early, step]
-    for model in models:
+    for model in (device, first, early, step):
         onnx.checker.check_model(model)
-    return EstimatorFiles(*(bytes(model.SerializeToString()) for model in models))
+    return EstimatorFiles(
+        operators=device.SerializeToString(),
+        first=first.SerializeToString(),
+        early=early.SerializeToString(),
+        step=step.SerializeToString(),
+    )
 
 
 def whole_onnx(files: EstimatorFiles, steps: int, table: SamplingTable) -> bytes:

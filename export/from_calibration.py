@@ -14,7 +14,7 @@ from lightpage.export.estimator_graphs import WholeGraph, whole_onnx, with_const
 from lightpage.export.graph import FieldGraph
 from lightpage.export.onnx_files import field_onnx, twin_onnx
 from lightpage.export.parity import check_parity
-from lightpage.export.proof import check_new, proven, version_of
+from lightpage.export.proof import check_new, proven
 from lightpage.export.run_graph import golden_of
 from lightpage.metrics.provenance import command, commit
 from lightpage.progress import Progress
@@ -32,6 +32,7 @@ from lightpage.runtime.model.bundle.manifest import (
     TWIN,
     Manifest,
     Provenance,
+    version_of,
 )
 from lightpage.runtime.model.execution.estimator_graph import CHI_SQUARE
 from lightpage.runtime.model.execution.session import open_session

@@ -13,7 +13,7 @@ from lightpage.export.graph import FRAME_INPUTS, DecoderGraph, FieldGraph
 from lightpage.export.half import LARGEST_DEVIATION, check_deviation, in_half, rounded
 from lightpage.export.onnx_files import decoder_onnx, field_onnx, twin_onnx
 from lightpage.export.parity import check_parity
-from lightpage.export.proof import check_new, proven, version_of
+from lightpage.export.proof import check_new, proven
 from lightpage.export.run_graph import golden_of, graph_of
 from lightpage.progress import Progress, note
 from lightpage.recording.frame_pair import FramePair
@@ -30,6 +30,7 @@ from lightpage.runtime.model.bundle.manifest import (
     Manifest,
     Precision,
     Provenance,
+    version_of,
 )
 from lightpage.runtime.model.decoding.golden import GOLDEN_TOLERANCE
 from lightpage.runtime.model.execution.page_graph import PAGE_INPUTS

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import re
 import shutil
-from datetime import datetime
 from pathlib import Path
 
 from lightpage.errors import BundleError, InvalidInputError
@@ -13,7 +11,7 @@ from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.coded_pages import choose_code
 from lightpage.runtime.archives.recordings.evaluation import check_recording
 from lightpage.runtime.model.bundle.bundle import write_bundle
-from lightpage.runtime.model.bundle.manifest import Manifest, check_version, sha256
+from lightpage.runtime.model.bundle.manifest import Manifest, check_version
 from lightpage.runtime.model.decoding.batch_graph import with_proven_batches
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
@@ -61,12 +59,6 @@ def proven(
     finally:
         _remove(partial)
     return manifest, files
-
-
-def version_of(name: str, created: datetime, decoder: bytes) -> str:
-    """A version that no other bundle has: name, time (UTC) and the beginning of the decoder's hash."""
-    plain = re.sub(r"[^A-Za-z0-9_.+-]", "_", name).lstrip("_.+-")[:60] or "bundle"
-    return f"{plain}-{created:%Y%m%dT%H%M%SZ}-{sha256(decoder)[:8]}"
 
 
 def _remove(path: Path) -> None:

@@ -12,15 +12,13 @@ from lightpage.export.estimator_graphs import WholeGraph
 from lightpage.export.graph import DecoderGraph, Graph, PublishedGraph, published_tensors, table_tensors
 from lightpage.export.parity import torch_answer
 from lightpage.recording.frame_pair import FramePair
-from lightpage.runtime.model.bundle.bundle import in_few_counts, in_few_roots, shows_page
+from lightpage.runtime.model.bundle.bundle import in_few_counts, in_few_roots, residual_limit, shows_page
 from lightpage.train.models.twin import RayTwin, TorchTwin
 from lightpage.train.published.trainer import published_decoder
 from lightpage.train.published.training import PublishedChoices
 from lightpage.train.runs import Run, load_decoder, load_weights
 
 Tensors = dict[str, NDArray[np.generic]]
-_LEAST_CONTRAST = 2.0
-"""Residual of swapped frames over that of right ones below which the two cannot be told apart by it."""
 
 
 def graph_of(folder: Path, run: Run, references: FramePair, twin: RayTwin) -> tuple[Graph, Tensors]:
@@ -68,9 +66,8 @@ def _residual_limit(
     answer: dict[str, NDArray[np.float32]],
     residual: str,
 ) -> float | None:
-    """Half way, in ratio, between the residuals of right and of swapped frames; None where both are alike."""
+    """See `residual_limit`."""
     if residual not in graph.outputs:
         return None
-    right = float(answer[residual])
     swapped = float(torch_answer(graph, FramePair(pair.quadrature, pair.in_phase), defaults)[residual])
-    return float(np.sqrt(right * swapped)) if swapped > _LEAST_CONTRAST * right else None
+    return residual_limit(float(answer[residual]), swapped)

@@ -20,10 +20,10 @@ from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.study.lights import DataSet
 from lightpage.study.study import Result, Settings
 from lightpage.study.trained import curves_in, split
-from lightpage.train.commands.calibrate import calibrate_recording
 from lightpage.train.models.presets import PRESETS
 from lightpage.train.processes import Processes
 from lightpage.train.published.held_pages import MadePages
+from lightpage.train.trainers.calibration import calibrate_recording
 from lightpage.train.trainers.symbols import SymbolTrainer
 from lightpage.train.trainers.whole_run import Split, make_run, usable_pages
 

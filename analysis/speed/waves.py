@@ -40,8 +40,8 @@ from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.model.execution.estimator_graph import NOISE
-from lightpage.train.commands.calibrate import calibrate_recording
 from lightpage.train.runs import begin
+from lightpage.train.trainers.calibration import calibrate_recording
 
 _TIMED = 7
 """Timed inferences of each decoder."""

@@ -16,12 +16,17 @@ from lightpage.calibration.likelihood.measure import estimator_table
 from lightpage.calibration.likelihood.statistics import Statistics
 from lightpage.calibration.likelihood.table import FLAT_FIELD, MEASUREMENT_INPUTS, known_p
 from lightpage.calibration.sampling_table import APART, SamplingTable
+from lightpage.errors import CalibrationError
 from lightpage.recording.frame_pair import FramePair
-from lightpage.runtime.model.execution.estimator_graph import DERIVATIVES, NOISE, EstimatorGraph
-from lightpage.runtime.recalibration.noise import KnownPhases, deviation_prior_scale, measured_noise
+from lightpage.runtime.model.execution.estimator_graph import CHI_SQUARE, DERIVATIVES, NOISE, EstimatorGraph
+from lightpage.runtime.recalibration.noise import MOST_STEPS, KnownPhases, deviation_prior_scale, measured_noise
 
 _FED = ("count_scale", "count_weights", "information", "responses", "nuisance_covariance", "nuisance_precision")
 """Tensors from which no wave operator is computed. They are fed with each evaluation."""
+MOST_CHI_SQUARE = 2.0
+"""Largest mean square of a known page's residuals over their variance. It is 1 with the calibration's own references.
+A small device's page has 5.5 with references at 0.9 times the exposure, 11 with mirrored references, and 3.3 with
+references that are shifted by 20 pixels."""
 
 
 class GraphLikelihood:
@@ -123,3 +128,30 @@ def measured_table(
     prior_scale = deviation_prior_scale(device.profile, statistics)
     earlier = graph.value(FLAT_FIELD) if FLAT_FIELD in graph.ports else None
     return table | measured_noise(graph.with_table(table), known, mask, prior_scale, steps, earlier)
+
+
+def check_counts(graph: EstimatorGraph, known: KnownPhases, mask: NDArray[np.bool_], subject: str) -> None:
+    """Check that a known page's counts scatter about the expected counts as the calibration's statistics say.
+
+    Args:
+        graph: graph of the calibrated device.
+        known: page of the calibration.
+        mask: positions of the pilots, bool [ny, nx].
+        subject: name of the page, for the error.
+
+    Raises:
+        CalibrationError: the counts scatter more, as with references other than those of the calibration.
+    """
+    feeds = known.feeds(mask)
+    page = graph.first_estimate(feeds)
+    p = known_p(known.phases)
+    nuisance = page["nuisance"]
+    chi_square = np.inf
+    for _ in range(MOST_STEPS):
+        outputs = graph.derivatives(page, feeds, p, nuisance, ("nuisance", CHI_SQUARE))
+        nuisance = outputs["nuisance"]
+        chi_square = float(outputs[CHI_SQUARE])
+    if not chi_square <= MOST_CHI_SQUARE:
+        got = f"counts that scatter {chi_square:.3g} times as much as the calibration says"
+        expected = f"at most {MOST_CHI_SQUARE:g} times; are these the calibration's references? Or calibrate anew"
+        raise CalibrationError(subject, got, expected)

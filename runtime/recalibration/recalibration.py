@@ -158,7 +158,7 @@ def recalibrate(
     verdict = judge(before, after, pages.levels)
     within(whole - WRITING_WORTH, whole, "write the new bundle", 0.0)
     bundle = refitted.bundle
-    golden, p = _golden(refitted, held_back.pairs[0])
+    golden, p = golden_page(refitted, held_back.pairs[0])
     files = {**bundle.files, GOLDEN: npz(in_phase=golden.in_phase, quadrature=golden.quadrature, p=p)}
     bundle = with_proven_batches(replace(bundle, files=files), refitted.graph)
     write_bundle(out, _new_manifest(bundle.manifest, pages, version, verdict), bundle.files)
@@ -178,7 +178,7 @@ def recalibrate(
     )
 
 
-def _golden(decoder: Decoder, pair: FramePair) -> tuple[FramePair, NDArray[np.float32]]:
+def golden_page(decoder: Decoder, pair: FramePair) -> tuple[FramePair, NDArray[np.float32]]:
     """The golden page's frames, in few counts where they still show a page, and the answer to them."""
     manifest = decoder.bundle.manifest
     answer = decoder.infer(pair, alone=True)

@@ -38,7 +38,7 @@ from lightpage.study.kept import KeptDecoder, Teaching, taught
 from lightpage.study.knobs import KNOBS, Knob
 from lightpage.study.known import FITTED_PAGES, Known
 from lightpage.study.study import Case, Result, Row, Settings, Study, load_result
-from lightpage.train.commands.calibrate import calibrate_recording
+from lightpage.train.trainers.calibration import calibrate_recording
 
 Real = NDArray[np.float64]
 

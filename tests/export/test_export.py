@@ -18,7 +18,7 @@ from lightpage.calibration.sampling_table import APART, apart_inputs, sampling_t
 from lightpage.device.state import Device
 from lightpage.errors import BundleError, InvalidInputError
 from lightpage.export import from_run, run_graph
-from lightpage.export.command import export
+from lightpage.export.commands.export import export
 from lightpage.export.from_run import export_run
 from lightpage.export.graph import TABLE_INPUTS, FieldGraph, angle
 from lightpage.export.onnx_files import field_onnx

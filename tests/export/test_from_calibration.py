@@ -20,7 +20,6 @@ from lightpage.codec.page_codec import PageCodec
 from lightpage.device.state import Device
 from lightpage.errors import BundleError, CalibrationError, FrameError, FramesDisagreeError, InvalidInputError
 from lightpage.export import from_calibration, proof
-from lightpage.export.estimated_device import check_counts
 from lightpage.export.from_calibration import export_calibration
 from lightpage.metrics.measures import measure
 from lightpage.page.correction import wrapped
@@ -44,6 +43,7 @@ from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.model.execution.estimator_graph import EstimatorGraph
 from lightpage.runtime.model.execution.session import open_session
 from lightpage.runtime.model.execution.twin import OnnxTwin
+from lightpage.runtime.recalibration.estimator import check_counts
 from lightpage.runtime.recalibration.known_pages import KnownPages
 from lightpage.runtime.recalibration.noise import MOST_STEPS, KnownPhases, measured_noise
 from lightpage.runtime.recalibration.recalibration import recalibrate

@@ -16,13 +16,13 @@ from lightpage.errors import RecordingError
 from lightpage.files import write_json
 from lightpage.progress import reporting
 from lightpage.recording.reader import Recording
-from lightpage.train.commands.calibrate import DEFAULT_PAGES, calibrate_recording
 from lightpage.train.commands.options import ACCEPT, chosen_localizer, chosen_trainer, given_choices, with_choices
 from lightpage.train.fitting.memory import keep_freed_memory
 from lightpage.train.models.decoder import LOCALIZERS
 from lightpage.train.processes import AUTO, STRATEGIES, Processes, Silence, is_first_process, wait_for_first
 from lightpage.train.published.localizers import NAMES as PUBLISHED
 from lightpage.train.runs import Run, sole_writer
+from lightpage.train.trainers.calibration import DEFAULT_PAGES, calibrate_recording
 from lightpage.train.trainers.whole_run import Split, make_run, usable_pages
 from lightpage.words import counted
 

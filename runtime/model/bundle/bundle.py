@@ -58,7 +58,8 @@ MAX_MANIFEST_BYTES = 16 << 20
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 """Fixed time in the zip, so that the same contents give the same bytes."""
 
-
+_LEAST_CONTRAST = 2.0
+"""Residual of swapped frames over that of right ones below which the two cannot be told apart by it."""
 _SIDE_PX = 2
 """Side of the blocks of pixels that get one count: a sample of the usual grid, which still has all fringes."""
 _COARSE_SHARE = 0.6
@@ -315,6 +316,11 @@ def read_manifest(path: Path) -> Manifest:
     if len(text) > MAX_MANIFEST_BYTES:
         raise BundleError(f"{subject}: {MANIFEST}", f"more than {MAX_MANIFEST_BYTES} bytes", "a shorter one")
     return parse_manifest(text, f"{subject}: {MANIFEST}")
+
+
+def residual_limit(right: float, swapped: float) -> float | None:
+    """Half way, in ratio, between the residuals of right and of swapped frames; None where both are alike."""
+    return float(np.sqrt(right * swapped)) if swapped > _LEAST_CONTRAST * right else None
 
 
 def shows_page(coarse: float, limit: float) -> bool:

@@ -2,6 +2,8 @@
 
 import hashlib
 import json
+import re
+from datetime import datetime
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
@@ -129,6 +131,12 @@ def check_version(version: str, subject: str) -> None:
     except ValidationError:
         expected = "1 to 100 letters, digits and _ . + -, a letter or digit first"
         raise BundleError(subject, repr(version), expected) from None
+
+
+def version_of(name: str, created: datetime, content: bytes) -> str:
+    """A version that no other bundle has: name, time (UTC) and the beginning of a content's hash."""
+    plain = re.sub(r"[^A-Za-z0-9_.+-]", "_", name).lstrip("_.+-")[:60] or "bundle"
+    return f"{plain}-{created:%Y%m%dT%H%M%SZ}-{sha256(content)[:8]}"
 
 
 def sha256(data: bytes) -> str:

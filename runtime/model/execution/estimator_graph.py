@@ -131,9 +131,7 @@ class EstimatorGraph:
         self.steps = most if steps is None else min(steps, most)
         if like is None:
             held = files.constants
-            self._operators = open_session(
-                files.operators, f"{subject}: operators", threads, once=True, constants=held
-            )
+            self._operators = open_session(files.operators, f"{subject}: operators", threads, once=True, constants=held)
             of_pages = partial(open_session, threads=threads, provider=provider, constants=held)
             self._first = of_pages(files.first, f"{subject}: first estimate")
             self._early = of_pages(files.early, f"{subject}: early step")

@@ -2,7 +2,7 @@
 
 from lightpage.errors import BundleError, InvalidInputError, raised_as
 from lightpage.runtime.model.bundle.bundle import Bundle
-from lightpage.runtime.model.bundle.manifest import DECODER, ESTIMATOR_FILES
+from lightpage.runtime.model.bundle.manifest import DECODER, EARLY, FIRST, OPERATORS, STEP
 from lightpage.runtime.model.execution.estimator_graph import EstimatorFiles, EstimatorGraph, most_steps
 from lightpage.runtime.model.execution.providers import ON_CPU, Provider
 from lightpage.runtime.model.execution.table_graph import GraphFile, TableGraph, check_table
@@ -38,8 +38,8 @@ def open_graph(
     if bundle.is_estimator:
         with raised_as(BundleError, InvalidInputError, about=f"{bundle.subject}: "):
             check_table(file.table_inputs, bundle.table)
-            held = {DECODER: bundle.files[DECODER]}
-            files = EstimatorFiles(*(bundle.files[name] for name in ESTIMATOR_FILES), constants=held)
+            held = bundle.files
+            files = EstimatorFiles(held[OPERATORS], held[FIRST], held[EARLY], held[STEP], {DECODER: held[DECODER]})
             return EstimatorGraph(files, file, bundle.subject, threads, bundle.table, provider=provider, steps=steps)
     with raised_as(BundleError, InvalidInputError, about=f"{bundle.subject}: "):
         return TableGraph(file, subject, PAGE_INPUTS, threads, bundle.table, provider=provider)

@@ -4,41 +4,45 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
 from pathlib import Path
 
 import click
 import numpy as np
-import torch
 
-from lightpage.calibration import calibrate as registration
 from lightpage.calibration.coherence import seen_share
-from lightpage.calibration.document import BlemishCounts, Calibration, load_calibration
+from lightpage.calibration.document import Calibration, load_calibration
 from lightpage.calibration.goodness.figure import goodness_figure
-from lightpage.calibration.known_pages import first_lit_pages, known_pages, without_blemishes
-from lightpage.calibration.likelihood.device_fit import DeviceFit
+from lightpage.calibration.interfaces import Twin
+from lightpage.calibration.known_pages import first_lit_pages
+from lightpage.cli.main import missing
 from lightpage.cli.options import JSON, named_profile, new_file, profile_option
-from lightpage.cli.paths import OutputFile
+from lightpage.cli.paths import NewPath, OutputFile
 from lightpage.cli.progress_bar import percent_bar
 from lightpage.device.profile import Profile
-from lightpage.errors import LightpageError
+from lightpage.errors import InvalidInputError, LightpageError
 from lightpage.files import replace_file, write_json
 from lightpage.pictures import write_figure_png
-from lightpage.progress import Progress, warn
-from lightpage.recording.pixels.blemishes import Blemishes
+from lightpage.progress import Progress, note, warn
 from lightpage.recording.reader import Recording
-from lightpage.train.data.features import CPU
-from lightpage.train.data.torch_engine import torch_device
-from lightpage.train.models.field import FieldRecovery, TorchFieldSolver
-from lightpage.train.models.likelihood.estimator import PhaseEstimator
-from lightpage.train.models.likelihood.torch_likelihood import TorchLikelihood
-from lightpage.train.models.twin import RayTwin, TorchTwin
+from lightpage.runtime.archives.recordings.new_device import (
+    OtherGraphsWantedError,
+    bundle_by_graphs,
+    calibrate_by_graphs,
+    check_graphs,
+)
+from lightpage.runtime.model.bundle.bundle import Bundle
+from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.execution.twin import OnnxTwin
 
 DEFAULT_PAGES = 2
 _DOTS = 150
 """Dots of a picture in an inch."""
 MAX_PAGES = 4
 """More cost time and add nothing that a decoder would notice."""
+_CPU = "cpu"
+_NO_GRAPHS = "none"
+"""Choice of torch in place of a bundle's graphs."""
 
 
 @click.command()
@@ -58,12 +62,19 @@ MAX_PAGES = 4
 @click.option(
     "--picture", type=OutputFile(), help="Draw to this PNG where the light lies that the fit does not explain."
 )
+@click.option("--export", "bundle", type=NewPath(), help="Write a bundle that reads the device's pages too: a .zip.")
+@click.option(
+    "--graphs",
+    metavar="BUNDLE|none",
+    help="Bundle of the same profile whose graphs calibrate, without torch; `none` for torch. By default the shipped "
+    "bundle, where it has the profile.",
+)
 @click.option(
     "--compute",
-    default="cpu",
+    default=_CPU,
     show_default=True,
     metavar="cpu|cuda[:N]",
-    help="Processor that recovers the light's field.",
+    help="Processor that recovers the light's field; other ones than the CPU need torch.",
 )
 @JSON
 def calibrate(
@@ -73,6 +84,8 @@ def calibrate(
     pages: int,
     orientation: str,
     picture: Path | None,
+    bundle: Path | None,
+    graphs: str | None,
     compute: str,
     json_path: Path | None,
 ) -> None:
@@ -81,18 +94,27 @@ def calibrate(
     The fit is called good where a decoder loses less than 0.1 bit a symbol by what it leaves unexplained, usable
     below 0.3, else wrong. A wrong one is written too, but over no better one, and ends the command with an error.
     """
-    start, device = time.perf_counter(), torch_device(compute)
+    start = time.perf_counter()
+    if compute != _CPU:
+        if graphs not in (None, _NO_GRAPHS):
+            raise InvalidInputError("--graphs", f"{graphs} with --compute {compute}", "one of them")
+        graphs = _NO_GRAPHS
     with Recording.open(recording) as file, percent_bar() as progress:
         profile = file.header.device(named_profile(profile_name))
         chosen = first_lit_pages(file, pages, warn)
-        calibration = calibrate_recording(
-            file, profile, chosen, progress, any_orientation=orientation == "any", compute=device
+        decoder = _decoder(graphs, file, profile)
+        calibration, decoder = _calibrated(
+            decoder, file, profile, chosen, progress, any_orientation=orientation == "any", compute=compute
         )
-    seconds = time.perf_counter() - start
-    kept = calibration.is_wrong and _is_better(out)
-    if not kept:
-        calibration.save(out)
-    lost = int(np.sum(seen_share(TorchTwin(RayTwin(profile)), calibration.vector, profile) < 0.5))
+        seconds = time.perf_counter() - start
+        kept = calibration.is_wrong and _is_better(out)
+        if not kept:
+            calibration.save(out)
+        exported = None
+        if bundle is not None and not calibration.is_wrong:
+            exported = _exported(decoder, calibration, file, profile, bundle, progress)
+    twin = _torch_twin(profile) if decoder is None else OnnxTwin(decoder.bundle)
+    lost = int(np.sum(seen_share(twin, calibration.vector, profile) < 0.5))
     if json_path is not None:
         write_json(json_path, figures(calibration, profile, seconds, lost))
     click.echo(table(calibration, profile))
@@ -111,8 +133,86 @@ def calibrate(
     )
     if found is not None and found.verdict == "good":
         click.echo(f"a good fit: about {found.bits_lost:.2f} bit a symbol lost to light that it does not explain")
+    if exported is not None:
+        click.echo(f"{bundle}: version {exported.version}, {time.perf_counter() - start:.0f} s")
     remedy = "the file keeps a better one: name another --out" if kept else "the file is there to be looked at"
     calibration.check_good(f"calibration {out}", f"; {remedy}")
+
+
+def _decoder(graphs: str | None, recording: Recording, profile: Profile) -> Decoder | None:
+    """Return a decoder whose graphs calibrate, or None for torch.
+
+    Args:
+        graphs: name or path of its bundle, `none`, or None for the shipped bundle where it fits.
+        recording: recording of the device.
+        profile: nominal device.
+    """
+    if graphs == _NO_GRAPHS:
+        return None
+    shipped = Bundle.open(bundle_path(DEFAULT if graphs is None else graphs))
+    fits = shipped.is_estimator and shipped.profile == profile
+    if graphs is None and not (fits and recording.bit_depth == shipped.manifest.camera_bit_depth):
+        return None
+    decoder = Decoder(shipped)
+    try:
+        check_graphs(decoder, recording)
+    except LightpageError:
+        if graphs is None:
+            return None
+        raise
+    return decoder
+
+
+def _calibrated(
+    decoder: Decoder | None,
+    recording: Recording,
+    profile: Profile,
+    pages: list[int],
+    progress: Progress,
+    *,
+    any_orientation: bool,
+    compute: str,
+) -> tuple[Calibration, Decoder | None]:
+    """Calibrate by the graphs of a decoder, or by torch; returns the decoder whose graphs did."""
+    if decoder is not None:
+        try:
+            found = calibrate_by_graphs(decoder, recording, pages, progress, any_orientation=any_orientation)
+        except OtherGraphsWantedError as error:
+            note(f"{error.subject}: {error.got}; once more, with torch")
+        else:
+            return found, decoder
+    try:
+        from lightpage.train.data.torch_engine import torch_device
+        from lightpage.train.trainers.calibration import calibrate_recording
+    except ModuleNotFoundError as error:
+        raise missing(f"lightpage calibrate, profile {profile.name}", error) from error
+    device = torch_device(compute)
+    found = calibrate_recording(recording, profile, pages, progress, any_orientation=any_orientation, compute=device)
+    return found, None
+
+
+def _exported(
+    decoder: Decoder | None,
+    calibration: Calibration,
+    recording: Recording,
+    profile: Profile,
+    out: Path,
+    progress: Progress,
+) -> Bundle:
+    """Write the bundle of a calibration with the graphs of a decoder, or with graphs of its own."""
+    if decoder is not None:
+        return bundle_by_graphs(decoder, calibration, recording, out, progress=progress)
+    from lightpage.export.from_calibration import export_calibration
+
+    exported, _ = export_calibration(calibration, recording, profile, out, progress=progress)
+    return exported
+
+
+def _torch_twin(profile: Profile) -> Twin:
+    """Return the ray tracer of a nominal device, in torch."""
+    from lightpage.train.models.twin import RayTwin, TorchTwin
+
+    return TorchTwin(RayTwin(profile))
 
 
 def _is_better(earlier: Path) -> bool:
@@ -121,57 +221,6 @@ def _is_better(earlier: Path) -> bool:
         return earlier.is_file() and not load_calibration(earlier).is_wrong
     except LightpageError:
         return False
-
-
-def calibrate_recording(
-    recording: Recording,
-    profile: Profile,
-    pages: Sequence[int],
-    progress: Progress,
-    *,
-    any_orientation: bool = False,
-    compute: torch.device = CPU,
-    near: Calibration | None = None,
-) -> Calibration:
-    """Calibrate with some pages of a recording.
-
-    Args:
-        recording: recording with known symbols.
-        profile: nominal device.
-        pages: numbers of the pages.
-        progress: called at the beginning of each stage, and with its finished share.
-        any_orientation: whether mirrored or turned cameras are accepted.
-        compute: processor that recovers the light's field.
-        near: earlier calibration of the same device, from which the fit starts; from nominal if left out.
-
-    Raises:
-        RecordingError: no symbols, no such page, or a recording of another profile.
-        CalibrationError: nothing within the capture range, or near the earlier calibration, explains the frames.
-    """
-    recording.header.check_against(profile)
-    twin = TorchTwin(RayTwin(profile))
-    blemishes = Blemishes.of(recording.references())
-    known = without_blemishes(known_pages(recording, profile, pages), blemishes)
-    solver = TorchFieldSolver(FieldRecovery(profile).to(compute))
-    device = twin, solver, profile, blemishes.references, known
-    if near is None:
-        registered = registration.calibrate(*device, progress, any_orientation=any_orientation)
-    else:
-        registered = registration.refine(*device, near.vector, near.turn_rad, progress, near.modulator, judged=False)
-    hashes = [recording.page_hash(page) for page in pages]
-    counts = BlemishCounts.of(blemishes)
-    if registered.conditions is None:
-        return Calibration.from_registered(registered, profile, hashes, blemishes=counts)
-    fit = DeviceFit(
-        TorchLikelihood(PhaseEstimator(profile, registered.parameters).eval()),
-        twin,
-        profile,
-        blemishes.references,
-        known,
-        lambda share: progress("likelihood of all known pages", share),
-    )
-    refined, statistics = fit.refined(registered, registered.conditions)
-    return Calibration.from_registered(refined, profile, hashes, statistics, counts)
 
 
 def figures(calibration: Calibration, profile: Profile, seconds: float, lost: int) -> dict[str, object]:

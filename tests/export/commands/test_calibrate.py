@@ -17,11 +17,11 @@ from lightpage.calibration.document import Calibration, load_calibration
 from lightpage.calibration.parameters import NAMES, PRIORS
 from lightpage.device.profile import load_profile
 from lightpage.errors import CalibrationError, FrameError, LightpageError, RecordingError
+from lightpage.export.commands.calibrate import calibrate
 from lightpage.progress import reporting
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
 from lightpage.recording.writer import RecordingWriter
-from lightpage.train.commands.calibrate import calibrate
 from tests.lightpage.small import EXPLAINED, UNEXPLAINED
 from tests.told import Told
 
@@ -60,7 +60,7 @@ def fake_registration(monkeypatch: pytest.MonkeyPatch, outcome: Registered | Bas
             raise outcome
         return outcome
 
-    monkeypatch.setattr("lightpage.train.commands.calibrate.registration.calibrate", register)
+    monkeypatch.setattr("lightpage.train.trainers.calibration.registration.calibrate", register)
 
 
 REGISTERED = Registered(
