@@ -26,16 +26,31 @@ setup: $(STAMP)  ## make the virtual environment with everything in it
 
 # Where a C compiler and the headers of Python are, the page code is compiled; the last line says whether it was.
 # Debian splits ensurepip off into a package of its own; there the machine's pip puts a pip into the environment.
-$(STAMP): pyproject.toml constraints.txt setup.py $(wildcard lightpage/codec/compiled/*.[ch])
-	@test -n "$(PYTHON)" || { echo "make: no python3 found; install Python 3.11 or newer" >&2; exit 1; }
-	@$(PYTHON) -c 'import sys; sys.exit("make: Python 3.11 or newer wanted, got " + sys.version if sys.version_info < (3, 11) else 0)'
-	@test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV) 2>/dev/null || \
-	  { $(PYTHON) -m venv --clear --without-pip $(VENV) && $(PYTHON) -m pip --python $(BIN)/python install --quiet pip; }
+SOURCES := pyproject.toml constraints.txt setup.py $(wildcard lightpage/codec/compiled/*.[ch])
+define environment
+@test -n "$(PYTHON)" || { echo "make: no python3 found; install Python 3.11 or newer" >&2; exit 1; }
+@$(PYTHON) -c 'import sys; sys.exit("make: Python 3.11 or newer wanted, got " + sys.version if sys.version_info < (3, 11) else 0)'
+@test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV) 2>/dev/null || \
+  { $(PYTHON) -m venv --clear --without-pip $(VENV) && $(PYTHON) -m pip --python $(BIN)/python install --quiet pip; }
+endef
+
+$(STAMP): $(SOURCES)
+	@echo "installing everything into $(VENV): 2.5 GB, in some three minutes"
+	$(environment)
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[cpu,train,dev]'
 	@$(BIN)/lightpage --version
 	@touch $@
 
-demo: $(STAMP)  ## run the whole main job on a simulated device, into out/demo
+# What reads, calibrates and serves pages; of a machine that has everything it installs nothing.
+READING := $(VENV)/.installed-reading
+$(READING): $(SOURCES)
+	@echo "installing what reads pages into $(VENV): 0.4 GB, in about a minute"
+	$(environment)
+	@test -e $(STAMP) || $(BIN)/pip install --quiet --constraint constraints.txt --editable '.[cpu]'
+	@$(BIN)/lightpage --version
+	@touch $@
+
+demo: $(READING)  ## run the whole main job on a simulated device, into out/demo
 	$(BIN)/lightpage demo --out out/demo
 
 HARDWARE := out/demo-hardware

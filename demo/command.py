@@ -15,6 +15,7 @@ from lightpage.demo.result import DemoResult
 from lightpage.errors import InvalidInputError
 from lightpage.metrics.provenance import write_figures
 from lightpage.runtime.archives.recordings.coded_pages import AIR_LEVELS
+from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 
 
@@ -25,12 +26,20 @@ from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 )
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help="Seed of the picture and pages.")
 @click.option("--source", "spec", help="A simulated device that runs as hardware, camera:FOLDER/device.toml.")
+@click.option(
+    "--calibrate/--no-calibrate",
+    default=None,
+    help="Calibrate the device first by two known pages, with the bundle's graphs; else the bundle must be the "
+    "device's own. The default is to calibrate, unless the bundle holds a network.",
+)
 @JSON
-def demo(bundle: str, out: Path, seed: int, spec: str | None, json_path: Path | None) -> None:
-    """Store a picture on the simulated device and read it back, before a drift, after it and healed by what was lost.
+def demo(
+    bundle: str, out: Path, seed: int, spec: str | None, calibrate: bool | None, json_path: Path | None
+) -> None:
+    """Calibrate a simulated device, store a picture on it, and read it before a drift, after it and healed by it.
 
-    Writes to the folder --out: pages.h5 (what the modulator shows), demo.json, demo.png, and the picture as it was read
-    in each state (.pgm).
+    Writes to the folder --out: known.h5 (two known pages), device.zip (the bundle made of them), pages.h5 (what the
+    modulator shows), demo.json, demo.png, and the picture as it was read in each state (.pgm).
     """
     from lightpage.demo.figure import write_figure  # matplotlib takes long to import
 
@@ -39,8 +48,10 @@ def demo(bundle: str, out: Path, seed: int, spec: str | None, json_path: Path | 
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InvalidInputError(f"--out {out}", error, "a folder that can be written") from None
+    path = bundle_path(bundle)
+    calibrate = Bundle.open(path).is_estimator if calibrate is None else calibrate
     with percent_bar() as progress:
-        result = run_demo(bundle_path(bundle), out, seed, progress, spec)
+        result = run_demo(path, out, seed, progress, spec, calibrate=calibrate)
     figures = result.to_json() | {"seconds": time.perf_counter() - start}
     for path in (out / "demo.json", json_path):
         write_figures(path, figures, bundle=bundle_path(bundle), options={"seed": seed, "source": spec})
@@ -70,7 +81,13 @@ def describe(result: DemoResult) -> str:
         margin = "" if step.margin_bits is None else f" margin {step.margin_bits:+.3f} bit a symbol,"
         due = ", recalibration due" if step.recalibration_due else ""
         lines.append(f"drift {step.share:.2f}:{margin} page {'lost' if step.lost else 'read'}{due}")
-    lines += result.story()[1:]
+    lines += result.story()[-2:]
+    if (calibration := result.calibration) is not None:
+        lines.insert(
+            0,
+            f"calibrated by {calibration.pages} known pages in {calibration.seconds:.0f} s: "
+            f"pipe's angle {calibration.angle_deg:.3f} degree\n",
+        )
     lines.append(
         f"healed in {result.healed.seconds:.0f} s; {result.healed.pages_used} of the lost pages came right first"
     )

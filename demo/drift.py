@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
+
+import numpy as np
 
 from lightpage.demo.result import DriftStep
 from lightpage.device.profile import Profile
-from lightpage.device.state import CameraPose, Device
+from lightpage.device.state import CameraPose, Device, draw_rough
 from lightpage.errors import InvalidInputError, LostPageError
-from lightpage.recording.pages import Pages
 from lightpage.runtime.client.client import LightpageClient
-from lightpage.runtime.device.acquisition.page_store import PageStore
 from lightpage.runtime.device.acquisition.simulator import SimulatorSource
 from lightpage.runtime.device.acquisition.source import FrameSource, open_source
 from lightpage.runtime.device.modulator.simulated import SimulatedModulator
 
+OTHER_DEVICE = 1
+"""Seed of the device that the demo calibrates."""
 DRIFT_STEPS = (0.04, 0.08, 0.15, 0.3)
 """Shares of the change of temperature of `drifted`: the code's margin lasts for the first, and nobody recalibrates."""
 
@@ -46,37 +47,45 @@ def drifted(device: Device, share: float = 1.0) -> Device:
     )
 
 
-def simulated_device(spec: str | None, profile: Profile, pages: Path) -> tuple[FrameSource, Callable[[Device], None]]:
-    """A simulated device that shows these pages, and what lets it drift.
+def other_device() -> Device:
+    """A device that nobody has calibrated: its numbers scatter as those of devices on a bench do."""
+    device = draw_rough(np.random.default_rng(OTHER_DEVICE))
+    return device.model_copy(update={"sensor": Device().sensor})
+
+
+def simulated_device(
+    spec: str | None, profile: Profile, *, known: bool
+) -> tuple[FrameSource, Callable[[Device], None], Device]:
+    """A simulated device, what lets it drift, and its true state.
 
     Args:
         spec: ``camera:DEVICE.toml`` of a simulated device that runs as hardware; None for one in this process.
         profile: nominal.
-        pages: file.
+        known: whether it is the simulator's default device, to which the shipped bundle belongs.
 
     Raises:
         InvalidInputError: a source that is no simulated device.
     """
     if spec is None:
-        simulator = SimulatorSource(profile, Device(), written=Pages.open(pages))
-        return simulator, simulator.set_device
+        device = Device() if known else other_device()
+        simulator = SimulatorSource(profile, device)
+        return simulator, simulator.set_device, device
     source = open_source(spec)
     modulator = source.modulator
     if not isinstance(modulator, SimulatedModulator):
         source.close()
         raise InvalidInputError(f"source {spec}", "no simulated device", "one of `lightpage virtual-device`")
-    source.show_pages(PageStore(profile, Pages.open(pages)))
-    return source, modulator.drift
+    return source, modulator.drift, Device()
 
 
 def drift_in_steps(
-    client: LightpageClient, drift: Callable[[Device], None], told: Callable[[], None]
+    client: LightpageClient, drift: Callable[[Device], None], device: Device, told: Callable[[], None]
 ) -> tuple[DriftStep, ...]:
     """Let the device drift in steps, and read one page after each."""
     steps: list[DriftStep] = []
     for share in DRIFT_STEPS:
         told()
-        drift(drifted(Device(), share))
+        drift(drifted(device, share))
         try:
             page = client.pages.read(0, user_data=True)
         except LostPageError as error:

@@ -23,7 +23,7 @@ _SHADES = 32
 
 def write_figure(result: DemoResult, path: Path) -> None:
     """Write the picture as PNG."""
-    figure = Figure(figsize=(14, 11), layout="constrained")
+    figure = Figure(figsize=(14, 11.3), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(3, 3)
     levels = result.code.levels

@@ -74,6 +74,21 @@ class Phase:
 
 
 @dataclass(frozen=True)
+class DemoCalibration:
+    """Calibration of the demo's device.
+
+    Attributes:
+        pages: number of known pages.
+        seconds: seconds from the first shot to the bundle.
+        angle_deg: angle of the pipe, degrees.
+    """
+
+    pages: int
+    seconds: float
+    angle_deg: float
+
+
+@dataclass(frozen=True)
 class DriftStep:
     """Step of the drift: what one page told.
 
@@ -105,8 +120,10 @@ class DemoResult:
     source: str = ""
     shots: dict[str, int] = field(default_factory=dict)
     """Shots of the cameras by how they ended; empty without cameras."""
+    calibration: DemoCalibration | None = None
+    """Calibration of the device; None where the bundle was its own."""
 
-    def story(self) -> tuple[str, str, str]:
+    def story(self) -> tuple[str, ...]:
         """Return the story of the demo for people, in lines of some 120 characters."""
         fresh, lost, again = (phase.air_bits_per_symbol for phase in self.phases)
         margin, healed, volume = self.phases[0].margin_bits, self.healed, self.volume
@@ -114,7 +131,13 @@ class DemoResult:
         angle = healed.report.angle_deg
         found = "" if angle is None else f" It found the pipe's angle: {angle:.3f} degree."
         rounds = f"{healed.rounds} round{'' if healed.rounds == 1 else 's'}"
+        calibrated = self.calibration
+        begun = () if calibrated is None else (
+            f"{calibrated.pages} known pages calibrate the device in {calibrated.seconds:.0f} s, without training. "
+            f"Its pipe's angle: {calibrated.angle_deg:.3f} degree.",
+        )
         return (
+            *begun,
             f"A picture of {volume.file_bytes} bytes lies on {volume.pages} pages, one spoilt on purpose.{spare}",
             f"The device drifts, AIR falls from {fresh:.2f} to {lost:.2f} bit a symbol, and no known page is shown.",
             f"The model heals by lost pages of user data: {rounds}, AIR {again:.2f} again.{found}",
@@ -126,6 +149,7 @@ class DemoResult:
         return {
             "seed": self.seed,
             "source": self.source,
+            "calibration": None if self.calibration is None else asdict(self.calibration),
             "shots": self.shots,
             "pages": self.volume.pages,
             "levels": self.code.levels,

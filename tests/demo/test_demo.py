@@ -64,7 +64,7 @@ def test_drift_leaves_what_cannot_drift() -> None:
 
 def test_a_bundle_without_code_field_or_calibration_is_no_demo(decoder: Decoder, tmp_path: Path) -> None:
     with pytest.raises(BundleError, match="code: got none"):
-        run_demo(decoder.bundle.path, tmp_path, 0)
+        run_demo(decoder.bundle.path, tmp_path, 0, calibrate=False)
     with pytest.raises(CalibrationError, match="calibration"):
         refit(decoder.bundle, known(count=1), quiet, decoder)
 
@@ -79,7 +79,7 @@ def test_a_picture_is_lost_by_drift_and_won_back_by_its_pages_with_the_shipped_b
     apart = partial(recalibrate_apart, worker="tests.runtime.recalibration.toy_worker:Unyielding")
     monkeypatch.setattr("lightpage.runtime.service.jobs.recalibrator.recalibrate_apart", apart)
     monkeypatch.setattr("lightpage.runtime.service.jobs.kept_pages._KEPT", 5)  # what was read before the drift is gone
-    run(demo, "--out", tmp_path)
+    run(demo, "--no-calibrate", "--out", tmp_path)
     figures = json.loads((tmp_path / "demo.json").read_text())
     fresh, lost, again = figures["phases"]
     assert figures["pages"] == 5
