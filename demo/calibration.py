@@ -10,13 +10,15 @@ from lightpage.page.symbols import random_symbols
 from lightpage.progress import Progress
 from lightpage.recording.reader import Recording
 from lightpage.recording.writer import RecordingWriter
-from lightpage.runtime.archives.recordings.new_device import bundle_by_graphs, calibrate_by_graphs, check_graphs
+from lightpage.runtime.archives.recordings.new_bundle import bundle_by_graphs, check_graphs
 from lightpage.runtime.device.acquisition.page_store import PageStore
 from lightpage.runtime.device.acquisition.source import FrameSource
 from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.recalibration.from_nominal import calibrate_by_graphs
 
 KNOWN_PAGES = 2
 _LEVELS = 256
+_VERSION = "demo-1"
 _CALIBRATION_SHARE = 0.7
 """Share of the time until the device is calibrated; the rest measures its noise and chooses a code."""
 
@@ -64,6 +66,7 @@ def calibrated_decoder(decoder: Decoder, recording: Path, out: Path, progress: P
             calibration,
             pages,
             out,
+            version=_VERSION,
             progress=lambda what, share: progress(what, _CALIBRATION_SHARE + (1 - _CALIBRATION_SHARE) * share),
         )
     return Decoder.load(out)

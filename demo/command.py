@@ -33,9 +33,7 @@ from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
     "device's own. The default is to calibrate, unless the bundle holds a network.",
 )
 @JSON
-def demo(
-    bundle: str, out: Path, seed: int, spec: str | None, calibrate: bool | None, json_path: Path | None
-) -> None:
+def demo(bundle: str, out: Path, seed: int, spec: str | None, calibrate: bool | None, json_path: Path | None) -> None:
     """Calibrate a simulated device, store a picture on it, and read it before a drift, after it and healed by it.
 
     Writes to the folder --out: known.h5 (two known pages), device.zip (the bundle made of them), pages.h5 (what the
@@ -48,10 +46,10 @@ def demo(
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InvalidInputError(f"--out {out}", error, "a folder that can be written") from None
-    path = bundle_path(bundle)
-    calibrate = Bundle.open(path).is_estimator if calibrate is None else calibrate
+    model = bundle_path(bundle)
+    calibrate = Bundle.open(model).is_estimator if calibrate is None else calibrate
     with percent_bar() as progress:
-        result = run_demo(path, out, seed, progress, spec, calibrate=calibrate)
+        result = run_demo(model, out, seed, progress, spec, calibrate=calibrate)
     figures = result.to_json() | {"seconds": time.perf_counter() - start}
     for path in (out / "demo.json", json_path):
         write_figures(path, figures, bundle=bundle_path(bundle), options={"seed": seed, "source": spec})

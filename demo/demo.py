@@ -89,7 +89,10 @@ def run_demo(
             record_known_pages(source, decoder, recording, seed)
             (out / BUNDLE).unlink(missing_ok=True)
             decoder = calibrated_decoder(
-                decoder, recording, out / BUNDLE, lambda what, share: progress(f"calibrate: {what}", _CALIBRATION_SHARE * share)
+                decoder,
+                recording,
+                out / BUNDLE,
+                lambda what, share: progress(f"calibrate: {what}", _CALIBRATION_SHARE * share),
             )
             calibrated_s = time.perf_counter() - begun
         volume = write_pages(decoder, written, out / "pages.h5", seed)

@@ -15,8 +15,8 @@ from lightpage.runtime.device.acquisition.simulator import SimulatorSource
 from lightpage.runtime.device.acquisition.source import FrameSource, open_source
 from lightpage.runtime.device.modulator.simulated import SimulatedModulator
 
-OTHER_DEVICE = 1
-"""Seed of the device that the demo calibrates."""
+OTHER_DEVICE = 5
+"""Seed of the device that the demo calibrates; its cameras see nearly the same plane."""
 DRIFT_STEPS = (0.04, 0.08, 0.15, 0.3)
 """Shares of the change of temperature of `drifted`: the code's margin lasts for the first, and nobody recalibrates."""
 

@@ -132,9 +132,13 @@ class DemoResult:
         found = "" if angle is None else f" It found the pipe's angle: {angle:.3f} degree."
         rounds = f"{healed.rounds} round{'' if healed.rounds == 1 else 's'}"
         calibrated = self.calibration
-        begun = () if calibrated is None else (
-            f"{calibrated.pages} known pages calibrate the device in {calibrated.seconds:.0f} s, without training. "
-            f"Its pipe's angle: {calibrated.angle_deg:.3f} degree.",
+        begun = (
+            ()
+            if calibrated is None
+            else (
+                f"{calibrated.pages} known pages calibrate the device in {calibrated.seconds:.0f} s, without training. "
+                f"Its pipe's angle: {calibrated.angle_deg:.3f} degree.",
+            )
         )
         return (
             *begun,

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from lightpage.calibration.calibrate import KnownPage
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.document import Calibration
-from lightpage.calibration.known_pages import known_pages, without_blemishes
 from lightpage.calibration.likelihood.measure import estimator_table
 from lightpage.calibration.likelihood.table import PIXEL_GAINS, pilot_tensors
 from lightpage.calibration.sampling_table import APART, SamplingTable
@@ -23,10 +22,8 @@ from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import pilot_mask
 from lightpage.progress import Progress
 from lightpage.recording.frame_pair import FramePair
-from lightpage.recording.layout import narrow
-from lightpage.recording.pixels.blemishes import UNIT_GAIN, Blemishes
 from lightpage.recording.reader import Recording
-from lightpage.runtime.archives.recordings.new_device import calibrated_pages
+from lightpage.runtime.archives.recordings.new_bundle import calibrated_pages
 from lightpage.runtime.model.execution.estimator_graph import (
     DEVIATION_PRECISION,
     NO_DEVIATIONS,
@@ -36,6 +33,7 @@ from lightpage.runtime.model.execution.estimator_graph import (
 )
 from lightpage.runtime.model.execution.table_graph import HeldTable
 from lightpage.runtime.recalibration.estimator import check_counts
+from lightpage.runtime.recalibration.from_nominal import recorded_pages
 from lightpage.runtime.recalibration.noise import MOST_STEPS, KnownPhases, deviation_prior_scale, measured_noise
 from lightpage.train.models.likelihood.estimator import PhaseEstimator
 from lightpage.train.models.likelihood.torch_likelihood import TorchLikelihood
@@ -111,10 +109,7 @@ def estimated_device(
     if (statistics := calibration.statistics) is None:
         raise CalibrationError("calibration: statistics", "none", "statistics of the counts: calibrate anew")
     used = calibrated_pages(calibration, recording)
-    bits = recording.bit_depth
-    recorded = [KnownPage(narrow(page.pair, bits), page.symbols) for page in known_pages(recording, profile, used)]
-    blemishes = Blemishes.of(narrow(recording.references(), bits))
-    pages = without_blemishes(recorded, blemishes)
+    blemishes, pages, last_pair = recorded_pages(recording, profile, used)
     device = calibration.device(profile, blemishes.references)
     twin = RayTwin(profile)
     estimator = PhaseEstimator(profile, device.parameters).eval()
@@ -132,10 +127,8 @@ def estimated_device(
     table |= pilot_tensors(_pilots(device, mask, own))
     table[NOISE] = np.tile(np.array([1, 0], np.float32), (MOST_STEPS + 1, 1))
     table[DEVIATION_PRECISION] = NO_DEVIATIONS
-    optional = device.apart_inputs
-    if not blemishes.none:
-        table[PIXEL_GAINS] = np.full_like(blemishes.gains, UNIT_GAIN)  # the known pages have been corrected
-        optional += (PIXEL_GAINS,)
+    table[PIXEL_GAINS] = blemishes.unit_gains  # the known pages have been corrected
+    optional = (*device.apart_inputs, PIXEL_GAINS)
     estimator.thinned = _thinned_grid_suffices(estimator, table, KnownPhases.of(pages[0], device), mask)
     progress("graphs to ONNX", 0.0)
     graphs = estimator_files(estimator, pages[0].pair.in_phase.dtype.name, optional, table)
@@ -144,9 +137,8 @@ def estimated_device(
     known = [KnownPhases.of(page, device) for page in pages]
     check_counts(graph, known[0], mask, f"recording {recording.path}, page {used[0]}")
     table |= measured_noise(graph, known, mask, deviation_prior_scale(profile, statistics), steps)
-    if PIXEL_GAINS in optional:
-        table[PIXEL_GAINS] = blemishes.gains
-    return EstimatedDevice(device, twin, estimator, graphs, table, optional, pages, recorded[-1].pair, mask, own)
+    table[PIXEL_GAINS] = blemishes.gains
+    return EstimatedDevice(device, twin, estimator, graphs, table, optional, pages, last_pair, mask, own)
 
 
 def _thinned_grid_suffices(

@@ -24,16 +24,11 @@ from lightpage.files import replace_file, write_json
 from lightpage.pictures import write_figure_png
 from lightpage.progress import Progress, note, warn
 from lightpage.recording.reader import Recording
-from lightpage.runtime.archives.recordings.new_device import (
-    OtherGraphsWantedError,
-    bundle_by_graphs,
-    calibrate_by_graphs,
-    check_graphs,
-)
+from lightpage.runtime.archives.recordings.new_bundle import bundle_by_graphs, calibrating_decoder
 from lightpage.runtime.model.bundle.bundle import Bundle
-from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.execution.twin import OnnxTwin
+from lightpage.runtime.recalibration.from_nominal import OtherGraphsWantedError, calibrate_by_graphs
 
 DEFAULT_PAGES = 2
 _DOTS = 150
@@ -102,7 +97,7 @@ def calibrate(
     with Recording.open(recording) as file, percent_bar() as progress:
         profile = file.header.device(named_profile(profile_name))
         chosen = first_lit_pages(file, pages, warn)
-        decoder = _decoder(graphs, file, profile)
+        decoder = None if graphs == _NO_GRAPHS else calibrating_decoder(graphs, file, profile)
         calibration, decoder = _calibrated(
             decoder, file, profile, chosen, progress, any_orientation=orientation == "any", compute=compute
         )
@@ -113,8 +108,7 @@ def calibrate(
         exported = None
         if bundle is not None and not calibration.is_wrong:
             exported = _exported(decoder, calibration, file, profile, bundle, progress)
-    twin = _torch_twin(profile) if decoder is None else OnnxTwin(decoder.bundle)
-    lost = int(np.sum(seen_share(twin, calibration.vector, profile) < 0.5))
+    lost = _symbols_beside_cameras(decoder, calibration, profile)
     if json_path is not None:
         write_json(json_path, figures(calibration, profile, seconds, lost))
     click.echo(table(calibration, profile))
@@ -137,30 +131,6 @@ def calibrate(
         click.echo(f"{bundle}: version {exported.version}, {time.perf_counter() - start:.0f} s")
     remedy = "the file keeps a better one: name another --out" if kept else "the file is there to be looked at"
     calibration.check_good(f"calibration {out}", f"; {remedy}")
-
-
-def _decoder(graphs: str | None, recording: Recording, profile: Profile) -> Decoder | None:
-    """Return a decoder whose graphs calibrate, or None for torch.
-
-    Args:
-        graphs: name or path of its bundle, `none`, or None for the shipped bundle where it fits.
-        recording: recording of the device.
-        profile: nominal device.
-    """
-    if graphs == _NO_GRAPHS:
-        return None
-    shipped = Bundle.open(bundle_path(DEFAULT if graphs is None else graphs))
-    fits = shipped.is_estimator and shipped.profile == profile
-    if graphs is None and not (fits and recording.bit_depth == shipped.manifest.camera_bit_depth):
-        return None
-    decoder = Decoder(shipped)
-    try:
-        check_graphs(decoder, recording)
-    except LightpageError:
-        if graphs is None:
-            return None
-        raise
-    return decoder
 
 
 def _calibrated(
@@ -208,11 +178,16 @@ def _exported(
     return exported
 
 
-def _torch_twin(profile: Profile) -> Twin:
-    """Return the ray tracer of a nominal device, in torch."""
-    from lightpage.train.models.twin import RayTwin, TorchTwin
+def _symbols_beside_cameras(decoder: Decoder | None, calibration: Calibration, profile: Profile) -> int:
+    """Count the symbols most of whose light misses a camera."""
+    twin: Twin
+    if decoder is not None:
+        twin = OnnxTwin(decoder.bundle)
+    else:
+        from lightpage.train.trainers.calibration import nominal_twin
 
-    return TorchTwin(RayTwin(profile))
+        twin = nominal_twin(profile)
+    return int(np.sum(seen_share(twin, calibration.vector, profile) < 0.5))
 
 
 def _is_better(earlier: Path) -> bool:

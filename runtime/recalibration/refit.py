@@ -112,7 +112,7 @@ def refit(
         fitted = earlier.followed_by(Calibration.from_registered(registered, profile, [*hashes]))
         check_as_good(earlier, fitted)
         return traced(decoder, twin, references, fitted, image)
-    without_blemishes = {name: np.full_like(blemishes.gains, UNIT_GAIN) for name in graph.ports if name == PIXEL_GAINS}
+    without_blemishes = {name: blemishes.unit_gains for name in graph.ports if name == PIXEL_GAINS}
     likelihood = GraphLikelihood(graph.with_table(without_blemishes))
     fit = DeviceFit(
         likelihood,

@@ -50,7 +50,7 @@ def calibrate_recording(
         CalibrationError: nothing within the capture range, or near the earlier calibration, explains the frames.
     """
     recording.header.check_against(profile)
-    twin = TorchTwin(RayTwin(profile))
+    twin = nominal_twin(profile)
     blemishes = Blemishes.of(recording.references())
     known = without_blemishes(known_pages(recording, profile, pages), blemishes)
     solver = TorchFieldSolver(FieldRecovery(profile).to(compute))
@@ -73,3 +73,8 @@ def calibrate_recording(
     )
     refined, statistics = fit.refined(registered, registered.conditions)
     return Calibration.from_registered(refined, profile, hashes, statistics, counts)
+
+
+def nominal_twin(profile: Profile) -> TorchTwin:
+    """Return the ray tracer of a nominal device."""
+    return TorchTwin(RayTwin(profile))

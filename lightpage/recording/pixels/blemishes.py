@@ -74,6 +74,11 @@ class Blemishes:
         return cls(np.stack(gains), FramePair(*corrected))
 
     @property
+    def unit_gains(self) -> NDArray[np.uint8]:
+        """Gains of frames that are already `corrected`."""
+        return np.full_like(self.gains, UNIT_GAIN)
+
+    @property
     def none(self) -> bool:
         """Return whether no pixel has a blemish."""
         return bool((self.gains == UNIT_GAIN).all())

@@ -37,7 +37,7 @@ def test_an_image_that_has_moved_is_read_unless_it_is_not_followed() -> None:
     profile = load_profile("bench")
     simulator = Simulator(profile, Device(), seed=5)
     symbols = random_symbols(profile, 256, 1, np.random.default_rng(5))[0]
-    simulator.knock((2.5, -1.5))
+    simulator.knock((7.5, -4.5))
     pair, decoder = simulator.page(symbols), lightpage.load("bench", threads=1)
     data = ~decoder.bundle.pilot_mask
     assert (decoder.decode(pair).symbols != symbols)[data].mean() < 0.55

@@ -1,36 +1,32 @@
-"""Calibrates a device of a bundle's profile with the bundle's graphs, and writes its own bundle, without torch."""
+"""Writes the bundle of a calibrated device with the graphs of another bundle of its profile, without torch."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lightpage.calibration.calibrate import KnownPage, calibrate
-from lightpage.calibration.document import BlemishCounts, Calibration
-from lightpage.calibration.known_pages import known_pages, without_blemishes
-from lightpage.calibration.likelihood.device_fit import DeviceFit
+from lightpage.calibration.document import Calibration
 from lightpage.calibration.likelihood.table import FLAT_FIELD, PIXEL_GAINS
-from lightpage.calibration.sampling_table import apart_inputs
-from lightpage.errors import BundleError, CalibrationError, InvalidInputError
+from lightpage.device.profile import Profile
+from lightpage.errors import BundleError, CalibrationError, InvalidInputError, LightpageError
 from lightpage.progress import Progress, warn
 from lightpage.recording.frame_pair import FramePair
-from lightpage.recording.layout import narrow, page_hashes
-from lightpage.recording.pixels.blemishes import UNIT_GAIN, Blemishes
+from lightpage.recording.layout import page_hashes
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.coded_pages import choose_code
 from lightpage.runtime.archives.recordings.evaluation import check_recording, pilots_of
 from lightpage.runtime.model.bundle.bundle import Bundle, npz, residual_limit, write_bundle
 from lightpage.runtime.model.bundle.manifest import GOLDEN, Manifest, Provenance, version_of
+from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.model.execution.estimator_graph import EstimatorGraph
 from lightpage.runtime.model.execution.twin import OnnxTwin
 from lightpage.runtime.recalibration.estimator import GraphLikelihood, check_counts, measured_table
+from lightpage.runtime.recalibration.from_nominal import neutral_graph, recorded_pages
 from lightpage.runtime.recalibration.noise import KnownPhases
 from lightpage.runtime.recalibration.recalibration import golden_page, refitted_bundle
 from lightpage.runtime.recalibration.refit import traced
@@ -39,21 +35,20 @@ MOST_PAGES = 4
 """Largest number of known pages on which information and noise are measured."""
 
 
-class OtherGraphsWantedError(CalibrationError):
-    """A device needs tensors that the graphs of a bundle do not take."""
-
-
 def check_graphs(decoder: Decoder, recording: Recording) -> None:
     """Check that the graphs of a bundle can calibrate the device of a recording.
 
     Raises:
-        BundleError: the bundle's decoder is a network.
+        BundleError: the bundle's decoder is a network, or of a version before 0.3 and takes no gains of pixels.
         InvalidInputError: the recording has pilots at other places than the bundle.
         RecordingError, ProfileError: another profile, frame shape or bit depth.
     """
     bundle = decoder.bundle
     if not isinstance(decoder.graph, EstimatorGraph):
         raise BundleError(f"{bundle.subject}", "a network, trained for one device", "a bundle of a calibration")
+    if not {PIXEL_GAINS, FLAT_FIELD} <= decoder.graph.ports.keys():
+        got = "graphs that take no gains of pixels or no flat field"
+        raise BundleError(f"{bundle.subject}: table inputs", got, "a bundle that this version exported")
     check_recording(decoder, recording)
     mask = bundle.pilot_mask
     symbols = recording.symbols(0)
@@ -68,45 +63,31 @@ def check_graphs(decoder: Decoder, recording: Recording) -> None:
     raise InvalidInputError(f"recording {recording.path}: pilots", got, expected)
 
 
-def calibrate_by_graphs(
-    decoder: Decoder, recording: Recording, pages: Sequence[int], progress: Progress, *, any_orientation: bool = False
-) -> Calibration:
-    """Calibrate a device from nominal with the graphs of a bundle of its profile.
+def calibrating_decoder(graphs: str | None, recording: Recording, profile: Profile) -> Decoder | None:
+    """Load the decoder whose graphs calibrate the device of a recording.
 
     Args:
-        decoder: decoder of any device of the profile; see `check_graphs`.
-        recording: recording of the device, with known symbols.
-        pages: numbers of the pages.
-        progress: called at the beginning of each stage, and with its finished share.
-        any_orientation: whether mirrored or turned cameras are accepted.
+        graphs: path or name of its bundle; None for the shipped one.
+        recording: recording of the device.
+        profile: nominal device.
+
+    Returns:
+        The decoder; None where the shipped bundle does not fit.
 
     Raises:
-        RecordingError: no symbols, or no such page.
-        CalibrationError: nothing within the capture range explains the frames.
-        OtherGraphsWantedError: the cameras see different planes, which the graphs do not allow for.
+        LightpageError: the named bundle does not fit; see `check_graphs`.
     """
-    profile = decoder.bundle.profile
-    blemishes, known = _known(recording, decoder, pages)
-    twin = OnnxTwin(decoder.bundle)
-    device = twin, decoder.field_solver, profile, blemishes.references, known
-    registered = calibrate(*device, progress, any_orientation=any_orientation)
-    lacking = {*apart_inputs(registered.parameters)} - decoder.graph.ports.keys()
-    if lacking or registered.conditions is None:
-        got = "cameras that see different planes, which the graphs do not allow for"
-        expected = "graphs of this device (lightpage calibrate --graphs none)"
-        raise OtherGraphsWantedError(f"{decoder.bundle.subject}: graphs", got, expected)
-    likelihood = GraphLikelihood(_neutral(decoder))
-    fit = DeviceFit(
-        likelihood,
-        twin,
-        profile,
-        blemishes.references,
-        known,
-        lambda share: progress("likelihood of all known pages", share),
-    )
-    refined, statistics = fit.refined(registered, registered.conditions)
-    hashes = [recording.page_hash(page) for page in pages]
-    return Calibration.from_registered(refined, profile, hashes, statistics, BlemishCounts.of(blemishes))
+    bundle = Bundle.open(bundle_path(DEFAULT if graphs is None else graphs))
+    if graphs is None and bundle.profile != profile:
+        return None
+    decoder = Decoder(bundle)
+    try:
+        check_graphs(decoder, recording)
+    except LightpageError:
+        if graphs is None:
+            return None
+        raise
+    return decoder
 
 
 def bundle_by_graphs(
@@ -139,23 +120,22 @@ def bundle_by_graphs(
     if (statistics := calibration.statistics) is None:
         raise CalibrationError("calibration: statistics", "none", "statistics of the counts: calibrate anew")
     used = calibrated_pages(calibration, recording)
-    blemishes, known = _known(recording, decoder, used)
+    blemishes, known, pair = recorded_pages(recording, profile, used)
     device = calibration.device(profile, blemishes.references)
-    graph = _neutral(decoder)
+    graph = neutral_graph(decoder, blemishes)
     mask = decoder.bundle.pilot_mask
     twin = OnnxTwin(decoder.bundle)
     measured = measured_table(
         GraphLikelihood(graph), twin, device, known, statistics, mask, lambda share: progress("noise", 0.6 * share)
     )
-    result = traced(decoder, twin, blemishes.references, calibration, gains=_gains(decoder, blemishes))
+    result = traced(decoder, twin, blemishes.references, calibration, gains=blemishes.gains)
     result = replace(result, table={**result.table, **measured})
     fitted = refitted_bundle(decoder.bundle, result)
     new = decoder.of_bundle(fitted)
     assert isinstance(new.graph, EstimatorGraph)  # as that of `decoder`
-    first = new.graph.with_table(_without_gains(new.graph, blemishes))
-    check_counts(first, KnownPhases.of(known[0], device), mask, f"recording {recording.path}, page {used[0]}")
+    for_corrected = new.graph.with_table({PIXEL_GAINS: blemishes.unit_gains})
+    check_counts(for_corrected, KnownPhases.of(known[0], device), mask, f"recording {recording.path}, page {used[0]}")
     progress("choose the code of user bytes", 0.7)
-    pair = narrow(recording.frames(used[-1]), recording.bit_depth)
     swapped = FramePair(pair.quadrature, pair.in_phase)
     created = datetime.now(UTC)
     name = name or profile.name
@@ -209,34 +189,3 @@ def _with_code(decoder: Decoder, recording: Recording, manifest: Manifest) -> Ma
         warn(f"no code for user bytes: {lacking}")
         return manifest
     return manifest.model_copy(update={"code": choice.code.to_toml()})
-
-
-def _known(recording: Recording, decoder: Decoder, pages: Sequence[int]) -> tuple[Blemishes, list[KnownPage]]:
-    """Return the blemishes of a recording's cameras, and its known pages without them."""
-    bits = recording.bit_depth
-    references = narrow(recording.references(), bits)
-    read = known_pages(recording, decoder.bundle.profile, pages)
-    recorded = [KnownPage(narrow(page.pair, bits), page.symbols) for page in read]
-    if PIXEL_GAINS not in decoder.graph.ports:
-        return Blemishes(np.full((2, *references.in_phase.shape), UNIT_GAIN, np.uint8), references), recorded
-    blemishes = Blemishes.of(references)
-    return blemishes, without_blemishes(recorded, blemishes)
-
-
-def _gains(decoder: Decoder, blemishes: Blemishes) -> NDArray[np.uint8] | None:
-    """Return the gains of the pixels, where the graph takes them."""
-    return blemishes.gains if PIXEL_GAINS in decoder.graph.ports else None
-
-
-def _without_gains(graph: EstimatorGraph, blemishes: Blemishes) -> dict[str, NDArray[np.uint8]]:
-    """Return unit gains for frames that have been corrected, where the graph takes gains."""
-    return {PIXEL_GAINS: np.full_like(blemishes.gains, UNIT_GAIN)} if PIXEL_GAINS in graph.ports else {}
-
-
-def _neutral(decoder: Decoder) -> EstimatorGraph:
-    """Return the graph without the flat field and the gains of its own device."""
-    graph = decoder.graph
-    assert isinstance(graph, EstimatorGraph)  # see `check_graphs`
-    values = {FLAT_FIELD: 0, PIXEL_GAINS: UNIT_GAIN}
-    held = {name: value for name, value in values.items() if name in graph.ports}
-    return graph.with_table({name: np.full_like(graph.value(name), value) for name, value in held.items()})

@@ -1,0 +1,105 @@
+"""Calibrates a device from nominal with the graphs of a bundle of its profile, without torch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from lightpage.calibration.calibrate import KnownPage, calibrate
+from lightpage.calibration.document import BlemishCounts, Calibration
+from lightpage.calibration.known_pages import known_pages, without_blemishes
+from lightpage.calibration.likelihood.device_fit import DeviceFit
+from lightpage.calibration.likelihood.table import FLAT_FIELD, PIXEL_GAINS
+from lightpage.calibration.sampling_table import apart_inputs
+from lightpage.device.profile import Profile
+from lightpage.errors import CalibrationError
+from lightpage.progress import Progress
+from lightpage.recording.frame_pair import FramePair
+from lightpage.recording.layout import narrow
+from lightpage.recording.pixels.blemishes import Blemishes
+from lightpage.recording.reader import Recording
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.execution.estimator_graph import EstimatorGraph
+from lightpage.runtime.model.execution.twin import OnnxTwin
+from lightpage.runtime.recalibration.estimator import GraphLikelihood
+
+
+class OtherGraphsWantedError(CalibrationError):
+    """A device needs tensors that the graphs of a bundle do not take."""
+
+
+class RecordedPages(NamedTuple):
+    """Known pages of a recording.
+
+    Attributes:
+        blemishes: blemishes of the cameras.
+        corrected: pages without them.
+        last_pair: frames of the last page with them.
+    """
+
+    blemishes: Blemishes
+    corrected: list[KnownPage]
+    last_pair: FramePair
+
+
+def calibrate_by_graphs(
+    decoder: Decoder, recording: Recording, pages: Sequence[int], progress: Progress, *, any_orientation: bool = False
+) -> Calibration:
+    """Calibrate a device from nominal with the graphs of a bundle of its profile.
+
+    Args:
+        decoder: decoder of any device of the profile; see `check_graphs`.
+        recording: recording of the device, with known symbols.
+        pages: numbers of the pages.
+        progress: called at the beginning of each stage, and with its finished share.
+        any_orientation: whether mirrored or turned cameras are accepted.
+
+    Raises:
+        RecordingError: no symbols, or no such page.
+        CalibrationError: nothing within the capture range explains the frames.
+        OtherGraphsWantedError: the cameras see different planes, which the graphs do not allow for.
+    """
+    profile = decoder.bundle.profile
+    blemishes, known, _ = recorded_pages(recording, profile, pages)
+    twin = OnnxTwin(decoder.bundle)
+    device = twin, decoder.field_solver, profile, blemishes.references, known
+    registered = calibrate(*device, progress, any_orientation=any_orientation)
+    lacking = {*apart_inputs(registered.parameters)} - decoder.graph.ports.keys()
+    if lacking or registered.conditions is None:
+        got = "cameras that see different planes, which the graphs do not allow for"
+        expected = "graphs of this device (lightpage calibrate --graphs none)"
+        raise OtherGraphsWantedError(f"{decoder.bundle.subject}: graphs", got, expected)
+    likelihood = GraphLikelihood(neutral_graph(decoder, blemishes))
+    fit = DeviceFit(
+        likelihood,
+        twin,
+        profile,
+        blemishes.references,
+        known,
+        lambda share: progress("likelihood of all known pages", share),
+    )
+    refined, statistics = fit.refined(registered, registered.conditions)
+    hashes = [recording.page_hash(page) for page in pages]
+    return Calibration.from_registered(refined, profile, hashes, statistics, BlemishCounts.of(blemishes))
+
+
+def recorded_pages(recording: Recording, profile: Profile, pages: Sequence[int]) -> RecordedPages:
+    """Read known pages of a recording, with counts in the type that graphs take.
+
+    Raises:
+        FrameError, RecordingError: see `known_pages`.
+    """
+    bits = recording.bit_depth
+    blemishes = Blemishes.of(narrow(recording.references(), bits))
+    read = [KnownPage(narrow(page.pair, bits), page.symbols) for page in known_pages(recording, profile, pages)]
+    return RecordedPages(blemishes, without_blemishes(read, blemishes), read[-1].pair)
+
+
+def neutral_graph(decoder: Decoder, blemishes: Blemishes) -> EstimatorGraph:
+    """Return the graph without the flat field of its own device, for frames without blemishes."""
+    graph = decoder.graph
+    assert isinstance(graph, EstimatorGraph)  # that of a bundle of a calibration
+    no_flat_field = np.zeros(decoder.bundle.profile.page_shape, np.float32)
+    return graph.with_table({FLAT_FIELD: no_flat_field, PIXEL_GAINS: blemishes.unit_gains})
