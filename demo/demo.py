@@ -79,11 +79,12 @@ def run_demo(
     progress("load the bundle", 0.0)
     decoder = Decoder.load(bundle)
     written = picture()
+    volume = None if calibrate else write_pages(decoder, written, out / "pages.h5", seed)
     with ExitStack() as stack:
         source, drift, device = simulated_device(spec, decoder.bundle.profile, known=not calibrate)
         stack.enter_context(source)
         calibrated_s = None
-        if calibrate:
+        if volume is None:
             begun = time.perf_counter()
             recording = out / "known.h5"
             record_known_pages(source, decoder, recording, seed)
@@ -95,7 +96,7 @@ def run_demo(
                 lambda what, share: progress(f"calibrate: {what}", _CALIBRATION_SHARE * share),
             )
             calibrated_s = time.perf_counter() - begun
-        volume = write_pages(decoder, written, out / "pages.h5", seed)
+            volume = write_pages(decoder, written, out / "pages.h5", seed)
         source.show_pages(PageStore(decoder.bundle.profile, Pages.open(out / "pages.h5")))
         kept = UserPages(_KEPT_BYTES)
         plane = DataPlane(Models(decoder, loader=Loader(tracker_for)), source, observers=(kept,), limits=_LIMITS)

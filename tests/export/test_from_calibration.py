@@ -20,6 +20,7 @@ from lightpage.codec.page_codec import PageCodec
 from lightpage.device.state import Device
 from lightpage.errors import BundleError, CalibrationError, FrameError, FramesDisagreeError, InvalidInputError
 from lightpage.export import from_calibration, proof
+from lightpage.export.commands.calibrate import calibrate
 from lightpage.export.from_calibration import export_calibration
 from lightpage.metrics.measures import measure
 from lightpage.page.correction import wrapped
@@ -27,6 +28,7 @@ from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import random_symbols
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
+from lightpage.recording.writer import RecordingWriter
 from lightpage.runtime.archives.recordings.coded_pages import SeenPages, choose_code
 from lightpage.runtime.archives.recordings.evaluation import unseen_pages
 from lightpage.runtime.archives.run.job import Job
@@ -36,12 +38,22 @@ from lightpage.runtime.commands.archives.code import code
 from lightpage.runtime.commands.client.decode import page_report
 from lightpage.runtime.console.last_pages import LastPages
 from lightpage.runtime.model.bundle.bundle import Bundle, npz, write_bundle
-from lightpage.runtime.model.bundle.manifest import DECODER, GOLDEN, TWIN
+from lightpage.runtime.model.bundle.manifest import (
+    DECODER,
+    EARLY,
+    ESTIMATOR_FILES,
+    FIRST,
+    GOLDEN,
+    OPERATORS,
+    STEP,
+    TWIN,
+)
 from lightpage.runtime.model.decoding.batches import Batching
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
-from lightpage.runtime.model.execution.estimator_graph import EstimatorGraph
+from lightpage.runtime.model.execution.estimator_graph import EXPECTED, EstimatorFiles, EstimatorGraph
 from lightpage.runtime.model.execution.session import open_session
+from lightpage.runtime.model.execution.table_graph import GraphFile
 from lightpage.runtime.model.execution.twin import OnnxTwin
 from lightpage.runtime.recalibration.estimator import check_counts
 from lightpage.runtime.recalibration.known_pages import KnownPages
@@ -361,3 +373,54 @@ def test_its_pages_go_one_by_one_where_batches_are_wanted(bundle: Path, caplog: 
     decoder = Decoder.load(bundle, 1, batching=Batching(largest=4))
     assert decoder.batches.largest == 1
     assert "calibration alone" in caplog.text
+
+
+def test_the_graphs_calibrate_another_device_and_read_it(bundle: Path, tmp_path: Path) -> None:
+    other = Device().with_settings([f"geometry.pipe_angle_deg={Device().geometry.pipe_angle_deg + 0.2}"])
+    simulator = Simulator(PROFILE, other, seed=7)
+    recording = tmp_path / "other.h5"
+    with RecordingWriter(recording, PROFILE, 256, 8, simulator.references()) as writer:
+        for symbols in random_symbols(PROFILE, 256, 5, np.random.default_rng(7)):
+            writer.append(symbols, simulator.page(symbols))
+    out, document = tmp_path / "other.zip", tmp_path / "other.toml"
+    run(calibrate, "--graphs", bundle, "--recording", recording, "--out", document, "--export", out)
+    found = load_calibration(document)
+    assert found.goodness is not None
+    assert found.goodness.verdict == "good"
+    made = Bundle.open(out)
+    assert made.files[DECODER] == Bundle.open(bundle).files[DECODER]
+    assert made.manifest.calibrated_pages == found.calibrated_pages
+    assert made.manifest.version != Bundle.open(bundle).version
+    assert made.code is not None
+    assert found.angle_deg(PROFILE) == pytest.approx(other.geometry.pipe_angle_deg, abs=0.02)
+    assert air(Decoder.load(out), recording, range(2, 5)) > 6.2
+
+
+def test_a_network_calibrates_no_other_device_and_a_gpu_needs_torch(
+    small_bundle: Path, bundle: Path, small_device: list[str], tmp_path: Path
+) -> None:
+    common = ("--recording", small_device[3], "--out", tmp_path / "C.toml")
+    with pytest.raises(BundleError, match="a network, trained for one device"):
+        run(calibrate, *common, "--graphs", small_bundle)
+    with pytest.raises(InvalidInputError, match="--graphs"):
+        run(calibrate, *common, "--graphs", bundle, "--compute", "cuda")
+    assert not list(tmp_path.iterdir())
+
+
+def test_graphs_share_their_constants_with_the_one_for_other_servers(bundle: Path) -> None:
+    files = Bundle.open(bundle).files
+    assert sum(len(files[name]) for name in ESTIMATOR_FILES) < len(files[DECODER]) / 2
+    alone = EstimatorFiles(*(files[name] for name in (OPERATORS, FIRST, EARLY, STEP)))
+    with pytest.raises(BundleError, match="an ONNX model"):
+        EstimatorGraph(alone, GraphFile(files[DECODER], "decoder"), "alone", 1)
+
+
+def test_expected_counts_alone_are_those_of_the_whole_step(bundle: Path, small_device: list[str]) -> None:
+    graph = Decoder.load(bundle, 1).graph
+    assert isinstance(graph, EstimatorGraph)
+    with Recording.open(small_device[3]) as recording:
+        pair = recording.frames(2)
+    page = graph.first_estimate({"in_phase": pair.in_phase, "quadrature": pair.quadrature})
+    evaluated = page, {}, page["p"], page["nuisance"]
+    alone = graph.derivatives(*evaluated, (EXPECTED,))[EXPECTED]
+    np.testing.assert_allclose(alone, graph.derivatives(*evaluated)[EXPECTED], rtol=1e-5)

@@ -8,7 +8,7 @@ import pytest
 import lightpage
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device
-from lightpage.errors import BundleError, UnconfirmedPageError
+from lightpage.errors import BundleError, FramesDisagreeError, UnconfirmedPageError
 from lightpage.metrics.measures import measure
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import random_symbols
@@ -41,7 +41,7 @@ def test_an_image_that_has_moved_is_read_unless_it_is_not_followed() -> None:
     pair, decoder = simulator.page(symbols), lightpage.load("bench", threads=1)
     data = ~decoder.bundle.pilot_mask
     assert (decoder.decode(pair).symbols != symbols)[data].mean() < 0.55
-    with pytest.raises(UnconfirmedPageError):
+    with pytest.raises(FramesDisagreeError):
         NoTracker(Decoder(decoder.bundle, 1, decoder.graph)).decode(pair, 256)
 
 
