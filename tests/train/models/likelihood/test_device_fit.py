@@ -1,7 +1,7 @@
 """Claims about the fit of a device by the counts of all known pages: it comes nearer to the device, and no further."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -89,6 +89,15 @@ def test_parameters_that_were_not_fitted_are_held(known: Known) -> None:
     held = np.array([name != "in_phase_scale_x_relative" for name in NAMES])
     np.testing.assert_array_equal(found.parameters[held], start.parameters[held])
     assert not found.deviations[held].any()
+
+
+def test_a_verdict_allows_for_the_tilt_of_its_page(known: Known) -> None:
+    right = known.registered(["in_phase_scale_x_relative"])
+    tilted = replace(right, parameters=right.parameters + 0.1 * (np.array(NAMES) == "camera_tilt_x_rad"))
+    one, other = (known.refined(start).goodness for start in (right, tilted))
+    assert one is not None
+    assert other is not None
+    assert other.unexplained_relative == pytest.approx(one.unexplained_relative, abs=3e-4)
 
 
 class Backwards:
