@@ -37,13 +37,23 @@ class PageCodec:
         pilots: where the pilots are, bool [ny, nx].
         levels: levels of the pages that are read, where they are uneven; as many as the code has.
         threads: number of threads that share the work on a page where it is compiled.
+        earlier: codecs of codes with which other pages were written. A page is read with the code that its header
+            names.
 
     Raises:
         InvalidInputError: the page is too small for this code.
     """
 
-    def __init__(self, code: Code, pilots: NDArray[np.bool_], levels: Levels | None = None, threads: int = 1) -> None:
+    def __init__(
+        self,
+        code: Code,
+        pilots: NDArray[np.bool_],
+        levels: Levels | None = None,
+        threads: int = 1,
+        earlier: Sequence[PageCodec] = (),
+    ) -> None:
         self.code, self.pilots, self._levels, self._threads = code, pilots, levels or Levels(code.levels), threads
+        self._earlier = {codec.code.id: codec for codec in earlier if codec.code.id != code.id}
         data = int(np.count_nonzero(~pilots))
         count = header_symbols(code.levels)
         if count >= data:
@@ -134,7 +144,8 @@ class PageCodec:
         assert found.data is not None
         assert found.file is not None
         data = np.frombuffer(found.data, np.uint8)[None]
-        return np.asarray(self.encode([found.header], data, found.file, pilots)[0])
+        codec = self._earlier.get(found.header.code_id, self)
+        return np.asarray(codec.encode([found.header], data, found.file, pilots)[0])
 
     def decode(
         self,
@@ -158,6 +169,12 @@ class PageCodec:
             raise PageError("phase, concentration", shapes, f"{self.pilots.shape} twice, as the pilots have")
         mu, kappa = phase.ravel(), concentration.ravel()
         header = decode_header(mu[self._header], kappa[self._header], self._levels)
+        if header is None or header.code_id != self.code.id:
+            for codec in self._earlier.values():
+                found_earlier = codec.decode(phase, concentration, expected)
+                named = found_earlier.header
+                if named is not None and named.code_id == codec.code.id:
+                    return found_earlier
         other = header is not None and header.code_id != self.code.id and expected is None
         own = mu[self._body].astype(np.float64)
         blocks = self._blocks(own, kappa[self._body])

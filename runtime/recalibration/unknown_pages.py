@@ -61,7 +61,7 @@ class UnknownPages:
 
     def codec(self, decoder: Decoder) -> PageCodec:
         """Takes bytes off the pages as a decoder reads them."""
-        return PageCodec(self._code, decoder.bundle.pilot_mask, decoder.bundle.levels(self._code.levels))
+        return decoder.codec_of(self._code)
 
     def look(self, decoder: Decoder, fitted: FramePair | None = None) -> Look:
         """Decode the pages, and read their bytes.

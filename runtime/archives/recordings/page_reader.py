@@ -8,7 +8,6 @@ import numpy as np
 
 from lightpage.codec.code import Code
 from lightpage.codec.page_bytes import LOSSES, Header, Loss, PageBytes
-from lightpage.codec.page_codec import PageCodec
 from lightpage.codec.volume import Successor, Volume
 from lightpage.errors import (
     BundleError,
@@ -150,7 +149,7 @@ class PageReader:
         """Read with this model from now on."""
         self._decoder, self._tracker, code = decoder, tracker, self._code
         self._levels, self._pilots = decoder.bundle.levels(code.levels), decoder.written_pilots(code.levels)
-        self.codec = PageCodec(code, decoder.bundle.pilot_mask, self._levels, decoder.code_threads)
+        self.codec = decoder.codec_of(code)
 
     def read(self, pages: Sequence[int], take: Take, *, heals: bool = True) -> Iterator[RecoveredPage]:
         """Read pages, and heal the model by those that it does not read.

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from lightpage.codec.code import Code
 from lightpage.codec.page_bytes import PageBytes
-from lightpage.codec.page_codec import PageCodec
 from lightpage.codec.volume import Volume
 from lightpage.errors import RecordingError
 from lightpage.progress import track, warn
@@ -35,7 +34,7 @@ class ReadPages:
 
     def __init__(self, recording: Recording, decoder: Decoder, code: Code) -> None:
         self._recording, self._code = recording, code
-        self._codec = PageCodec(code, decoder.bundle.pilot_mask, decoder.bundle.levels(code.levels))
+        self._codec = decoder.codec_of(code)
         self._pilots = decoder.bundle.written_pilots(code.levels)
         self.symbols: dict[int, NDArray[np.uint8]] = {}
 

@@ -67,7 +67,8 @@ def code(
 
     The rate is the one that 999 of 1,000 pages still carry, as far as these pages can say: more pages, a higher rate.
     Says what is kept for drift, what that costs, and how much drift of each kind pages survive. Of a recording without
-    symbols, the pages of user data count that are read.
+    symbols, the pages of user data count that are read. The new bundle still reads pages of the bundle's earlier codes
+    that have as many levels.
     """
     if out is None and out_bundle is None:
         raise InvalidInputError("options", "neither --out nor --out-bundle", "at least one of them")
@@ -100,8 +101,13 @@ def code(
     if out is not None:
         best.code.save(out)
     if out_bundle is not None:
-        manifest = decoder.bundle.manifest.model_copy(update={"code": best.code.to_toml(), "version": version})
-        write_bundle(out_bundle, manifest, decoder.bundle.files)
+        bundle = decoder.bundle
+        earlier = bundle.manifest.earlier_codes
+        if bundle.code is not None and bundle.code.id != best.code.id:
+            earlier = (*earlier, bundle.code.to_toml())
+        update = {"code": best.code.to_toml(), "earlier_codes": earlier, "version": version}
+        manifest = bundle.manifest.model_copy(update=update)
+        write_bundle(out_bundle, manifest, bundle.files)
     kept_bits = best.kept * best.code.coded_bits
     figures = {
         "code": best.code.model_dump(),

@@ -250,6 +250,17 @@ class Bundle:
         return phases
 
     @cached_property
+    def earlier_codes(self) -> tuple[Code, ...]:
+        """Codes that the device's pages were written with before, the oldest first.
+
+        Raises:
+            BundleError: one of the manifest's earlier codes does not validate.
+        """
+        with raised_as(BundleError, InvalidInputError):
+            subject = f"{self.subject}: earlier codes"
+            return tuple(parse_code(text, subject) for text in self.manifest.earlier_codes)
+
+    @cached_property
     def code(self) -> Code | None:
         """Return how user bytes are protected on this device's pages, None where that was not chosen.
 

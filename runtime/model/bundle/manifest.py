@@ -79,13 +79,16 @@ class Manifest(BaseModel):
     """A pair with a larger residual is refused: swapped frames, frames of two shots, or another device."""
     code: str | None = None
     """How user bytes are protected on this device's pages, TOML of a `lightpage.codec.code.Code`; None: not chosen."""
+    earlier_codes: tuple[str, ...] = ()
+    """Codes that the device's pages were written with before, the oldest first; such pages are still read."""
     precision: Precision = FLOAT32
     """In which decoder.onnx computes its network and waves."""
     provenance: Provenance = Provenance()
 
     def to_json(self) -> bytes:
         """The manifest as JSON with a hash of itself, so that a damaged manifest is noticed like any other file."""
-        data = self.model_dump(mode="json")
+        # readers of before know no earlier codes
+        data = self.model_dump(mode="json", exclude=None if self.earlier_codes else {"earlier_codes"})
         return (json.dumps(data | {_SELF_HASH: _digest(data)}, indent=2, sort_keys=True) + "\n").encode()
 
 

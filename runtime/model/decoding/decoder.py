@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -39,6 +40,7 @@ from lightpage.runtime.model.execution.providers import ON_CPU, Provider
 from lightpage.words import brief
 
 if TYPE_CHECKING:
+    from lightpage.codec.code import Code
     from lightpage.codec.page_codec import PageCodec
 
 
@@ -272,13 +274,26 @@ class Decoder:
         Raises:
             BundleError: the bundle has no code, or one that does not fit its page.
         """
-        from lightpage.codec.page_codec import PageCodec
-
         if self.bundle.code is None:
             raise NoCodeError(f"{self.bundle.subject}: code", "none", "one, as `lightpage code --out-bundle` adds it")
         with raised_as(BundleError, InvalidInputError, about=f"{self.bundle.subject}: "):
-            code = self.bundle.code
-            return PageCodec(code, self.bundle.pilot_mask, self.bundle.levels(code.levels), self.code_threads)
+            return self.codec_of(self.bundle.code)
+
+    def codec_of(self, code: Code) -> PageCodec:
+        """Codec of this device's pages with a code. It also reads pages of the bundle's own codes.
+
+        Raises:
+            InvalidInputError: a code does not fit the page.
+        """
+        from lightpage.codec.page_codec import PageCodec
+
+        bundle = self.bundle
+
+        def codec(own: Code, earlier: Sequence[PageCodec] = ()) -> PageCodec:
+            return PageCodec(own, bundle.pilot_mask, bundle.levels(own.levels), self.code_threads, earlier)
+
+        others = (*bundle.earlier_codes, *([] if bundle.code is None else [bundle.code]))
+        return codec(code, [codec(other) for other in others])
 
     def written_pilots(self, levels: int) -> Pilots:
         """The pilots of pages that were written at `levels` levels, each on one of them.

@@ -61,6 +61,21 @@ def test_blocks_that_converge_on_a_page_that_fails_settle_their_symbols() -> Non
     assert np.mean(decided != symbols) > 0.01
 
 
+def test_pages_of_an_earlier_code_are_read_by_the_code_that_their_header_names() -> None:
+    first, rng = codec_of(64, 2, 700, 2, shape=(28, 44)), np.random.default_rng(4)
+    code = codec_of(64, 2, 750, 2, shape=(28, 44)).code
+    header = header_of(first)
+    data, symbols = written(first, header, rng)
+    seen = noisy(symbols, 64, np.inf, rng)
+    later = PageCodec(code, first.pilots, earlier=[first])
+    found = later.decode(*seen)
+    assert (found.data, found.header) == (data, header)
+    np.testing.assert_array_equal(later.encode_again(found, symbols[first.pilots]), symbols)
+    assert PageCodec(code, first.pilots).decode(*seen).loss is Loss.CODE
+    own, symbols = written(later, header_of(later), rng)
+    assert later.decode(*noisy(symbols, 64, np.inf, rng)).data == own
+
+
 class TestRoundTrip:
     @pytest.mark.parametrize(("levels", "coded", "rate", "corrections"), CODES)
     def test_what_is_written_is_read(self, levels: int, coded: int, rate: int, corrections: int) -> None:

@@ -17,6 +17,7 @@ from lightpage.recording.reader import Recording
 from lightpage.runtime.commands.archives.code import code as code_command
 from lightpage.runtime.commands.archives.encode import encode
 from lightpage.runtime.commands.archives.recover import recover
+from lightpage.runtime.model.bundle.bundle import Bundle
 from tests.runtime import coded, toy
 
 STORAGE = StorageError("page of the recording", "Input/output error", "data")
@@ -131,6 +132,22 @@ def test_code_is_chosen_by_known_pages_and_kept_in_a_bundle(tmp_path: Path) -> N
     assert 0.4 < 8 * figures["user_bytes_per_page"] / 364 / 5.1 < 0.95
     pages = coded.pages(tmp_path / "with.zip", tmp_path)
     assert pages.max() < figures["code"]["levels"]
+
+
+def test_a_bundle_with_a_new_code_reads_files_of_the_earlier_one(
+    bundle: Path, pages: np.ndarray, tmp_path: Path
+) -> None:
+    other = tmp_path / "other.zip"
+    later = coded.CODE.model_copy(update={"rate_per_mille": 550})
+    toy.write_toy_bundle(other, code=later.to_toml(), earlier_codes=(coded.CODE.to_toml(),))
+    recovered(other, coded.recording(tmp_path / "R.h5", pages))
+    assert (tmp_path / "read.bin").read_bytes() == coded.CONTENT
+    toy.write_toy_recording(tmp_path / "known.h5", toy.ToyDevice(), 256, 6)
+    made = tmp_path / "made.zip"
+    asked = f"--bundle {bundle} --recording {tmp_path / 'known.h5'} --out-bundle {made} --version toy-2"
+    CliRunner().invoke(code_command, asked.split(), standalone_mode=False, catch_exceptions=False)
+    assert Bundle.open(made).earlier_codes == (coded.CODE,)
+    assert Bundle.open(made).code not in (None, coded.CODE)
 
 
 def test_pages_that_are_read_are_known_and_choose_a_code_as_known_ones_do(
