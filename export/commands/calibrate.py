@@ -10,7 +10,7 @@ import click
 import numpy as np
 
 from lightpage.calibration.coherence import seen_share
-from lightpage.calibration.document import Calibration, load_calibration
+from lightpage.calibration.document import DEFAULT_PAGES, Calibration, load_calibration
 from lightpage.calibration.goodness.figure import goodness_figure
 from lightpage.calibration.interfaces import Twin
 from lightpage.calibration.known_pages import first_lit_pages
@@ -30,7 +30,6 @@ from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.execution.twin import OnnxTwin
 from lightpage.runtime.recalibration.from_nominal import OtherGraphsWantedError, calibrate_by_graphs
 
-DEFAULT_PAGES = 2
 _DOTS = 150
 """Dots of a picture in an inch."""
 MAX_PAGES = 4
@@ -98,9 +97,15 @@ def calibrate(
         profile = file.header.device(named_profile(profile_name))
         chosen = first_lit_pages(file, pages, warn)
         decoder = None if graphs == _NO_GRAPHS else calibrating_decoder(graphs, file, profile)
-        calibration, decoder = _calibrated(
-            decoder, file, profile, chosen, progress, any_orientation=orientation == "any", compute=compute
-        )
+        upright = orientation != "any"
+        try:
+            calibration = _calibrated(decoder, file, profile, chosen, progress, compute, upright=upright)
+        except OtherGraphsWantedError as error:
+            if graphs is not None:
+                raise
+            note(f"{error.subject}: {error.got}; once more, with torch")
+            decoder = None
+            calibration = _calibrated(decoder, file, profile, chosen, progress, compute, upright=upright)
         seconds = time.perf_counter() - start
         kept = calibration.is_wrong and _is_better(out)
         if not kept:
@@ -110,7 +115,8 @@ def calibrate(
             exported = _exported(decoder, calibration, file, profile, bundle, progress)
     lost = _symbols_beside_cameras(decoder, calibration, profile)
     if json_path is not None:
-        write_json(json_path, figures(calibration, profile, seconds, lost))
+        version = None if exported is None else exported.version
+        write_json(json_path, figures(calibration, profile, seconds, lost) | {"bundle_version": version})
     click.echo(table(calibration, profile))
     if lost:
         total = profile.page.columns * profile.page.rows
@@ -139,26 +145,20 @@ def _calibrated(
     profile: Profile,
     pages: list[int],
     progress: Progress,
-    *,
-    any_orientation: bool,
     compute: str,
-) -> tuple[Calibration, Decoder | None]:
-    """Calibrate by the graphs of a decoder, or by torch; returns the decoder whose graphs did."""
+    *,
+    upright: bool,
+) -> Calibration:
+    """Calibrate by the graphs of a decoder, or by torch where it is None."""
     if decoder is not None:
-        try:
-            found = calibrate_by_graphs(decoder, recording, pages, progress, any_orientation=any_orientation)
-        except OtherGraphsWantedError as error:
-            note(f"{error.subject}: {error.got}; once more, with torch")
-        else:
-            return found, decoder
+        return calibrate_by_graphs(decoder, recording, pages, progress, any_orientation=not upright)
     try:
         from lightpage.train.data.torch_engine import torch_device
         from lightpage.train.trainers.calibration import calibrate_recording
     except ModuleNotFoundError as error:
         raise missing(f"lightpage calibrate, profile {profile.name}", error) from error
     device = torch_device(compute)
-    found = calibrate_recording(recording, profile, pages, progress, any_orientation=any_orientation, compute=device)
-    return found, None
+    return calibrate_recording(recording, profile, pages, progress, any_orientation=not upright, compute=device)
 
 
 def _exported(

@@ -31,6 +31,8 @@ NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 NonNegativeCount = Annotated[int, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 PageHash = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+DEFAULT_PAGES = 2
+"""Number of known pages that a device is calibrated with."""
 _LATER = NAMES[KNOWN[0] :]
 _ADDED = {
     "parameters": {"lens_path_relative": -1.0, **dict.fromkeys(_LATER, 0.0)},

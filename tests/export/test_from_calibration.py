@@ -400,7 +400,7 @@ def test_a_network_calibrates_no_other_device_and_a_gpu_needs_torch(
     small_bundle: Path, bundle: Path, small_device: list[str], tmp_path: Path
 ) -> None:
     common = ("--recording", small_device[3], "--out", tmp_path / "C.toml")
-    with pytest.raises(BundleError, match="a network, trained for one device"):
+    with pytest.raises(BundleError, match="a network"):
         run(calibrate, *common, "--graphs", small_bundle)
     with pytest.raises(InvalidInputError, match="--graphs"):
         run(calibrate, *common, "--graphs", bundle, "--compute", "cuda")

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from lightpage.calibration.document import Calibration, load_calibration
+from lightpage.calibration.document import DEFAULT_PAGES, Calibration, load_calibration
 from lightpage.cli.options import JSON, FiniteRange, named_profile, profile_option
 from lightpage.cli.paths import OutputFolder
 from lightpage.cli.progress_bar import percent_bar
@@ -22,7 +22,7 @@ from lightpage.train.models.decoder import LOCALIZERS
 from lightpage.train.processes import AUTO, STRATEGIES, Processes, Silence, is_first_process, wait_for_first
 from lightpage.train.published.localizers import NAMES as PUBLISHED
 from lightpage.train.runs import Run, sole_writer
-from lightpage.train.trainers.calibration import DEFAULT_PAGES, calibrate_recording
+from lightpage.train.trainers.calibration import calibrate_recording
 from lightpage.train.trainers.whole_run import Split, make_run, usable_pages
 from lightpage.words import counted
 

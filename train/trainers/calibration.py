@@ -20,9 +20,6 @@ from lightpage.train.models.likelihood.estimator import PhaseEstimator
 from lightpage.train.models.likelihood.torch_likelihood import TorchLikelihood
 from lightpage.train.models.twin import RayTwin, TorchTwin
 
-DEFAULT_PAGES = 2
-"""Number of known pages that a device is calibrated with."""
-
 
 def calibrate_recording(
     recording: Recording,

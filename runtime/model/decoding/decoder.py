@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -280,20 +279,13 @@ class Decoder:
             return self.codec_of(self.bundle.code)
 
     def codec_of(self, code: Code) -> PageCodec:
-        """Codec of this device's pages with a code. It also reads pages of the bundle's own codes.
-
-        Raises:
-            InvalidInputError: a code does not fit the page.
-        """
+        """Codec of this device's pages with a code that fits them. It also reads pages of the bundle's own codes."""
         from lightpage.codec.page_codec import PageCodec
 
-        bundle = self.bundle
-
-        def codec(own: Code, earlier: Sequence[PageCodec] = ()) -> PageCodec:
-            return PageCodec(own, bundle.pilot_mask, bundle.levels(own.levels), self.code_threads, earlier)
-
-        others = (*bundle.earlier_codes, *([] if bundle.code is None else [bundle.code]))
-        return codec(code, [codec(other) for other in others])
+        bundle, threads = self.bundle, self.code_threads
+        own = [*bundle.earlier_codes, *([] if bundle.code is None else [bundle.code])]
+        codecs = [PageCodec(each, bundle.pilot_mask, bundle.levels(each.levels), threads) for each in own]
+        return PageCodec(code, bundle.pilot_mask, bundle.levels(code.levels), threads, codecs)
 
     def written_pilots(self, levels: int) -> Pilots:
         """The pilots of pages that were written at `levels` levels, each on one of them.
