@@ -58,7 +58,7 @@ class Row:
         ece: expected calibration error of the confidences.
         over_claim: claimed information minus the AIR, bits a symbol.
         seconds: median time of a page's inference.
-        over_shipped: this time over that of the shipped decoder, or of the bundle `--beside`.
+        over_other: this time over that of the shipped decoder, or of the bundle `--beside`.
     """
 
     steps: int
@@ -67,7 +67,7 @@ class Row:
     ece: float
     over_claim: float
     seconds: float
-    over_shipped: float
+    over_other: float
 
 
 def timed(decoders: list[tuple[Decoder, FramePair]]) -> list[float]:
@@ -150,7 +150,7 @@ def main(
         compared = Decoder.load(bundle_path(DEFAULT) if beside is None else beside)
         pair = narrow(file.frames(CALIBRATED), file.bit_depth)
         own = compared.bundle.golden.pair  # cameras may have another bit depth
-        shipped, *seconds = timed([(compared, own), *((decoder, pair) for decoder in decoders)])
+        other, *seconds = timed([(compared, own), *((decoder, pair) for decoder in decoders)])
         timed_decoders = zip(track(decoders, "decode", unit="number of steps"), seconds, strict=True)
         for steps, (decoder, duration) in enumerate(timed_decoders, 1):
             figures = evaluate(decoder, file, tracker_for(decoder)).figures
@@ -164,14 +164,14 @@ def main(
                     ece=figures.ece,
                     over_claim=figures.over_claim_bits_per_symbol,
                     seconds=duration,
-                    over_shipped=duration / shipped,
+                    over_other=duration / other,
                 )
             )
     for row in rows:
         of_bound = "" if row.over_bound is None else f", {row.over_bound:.4f} of the bound"
         click.echo(
             f"{row.steps} steps: AIR {row.air:.4f}{of_bound}; over-claim {row.over_claim:+.3f}, ECE {row.ece:.4f}; "
-            f"{1000 * row.seconds:.0f} ms, {row.over_shipped:.2f} of the other decoder's"
+            f"{1000 * row.seconds:.0f} ms, {row.over_other:.2f} of the other decoder's"
         )
     write_figures(json_path, {"asked": asked, "bound": limit, "rows": [asdict(row) for row in rows]}, asked=asked)
 
