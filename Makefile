@@ -44,7 +44,8 @@ $(STAMP): $(SOURCES)
 # What reads, calibrates and serves pages; of a machine that has everything it installs nothing.
 READING := $(VENV)/.installed-reading
 $(READING): $(SOURCES)
-	@echo "installing what reads pages into $(VENV): 0.4 GB, in about a minute"
+	@test ! -e $(STAMP) || $(MAKE) --no-print-directory $(STAMP)
+	@test -e $(STAMP) || echo "installing what reads pages into $(VENV): 0.4 GB, in about a minute"
 	$(environment)
 	@test -e $(STAMP) || $(BIN)/pip install --quiet --constraint constraints.txt --editable '.[cpu]'
 	@$(BIN)/lightpage --version

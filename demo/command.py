@@ -51,11 +51,13 @@ def demo(bundle: str, out: Path, seed: int, spec: str | None, calibrate: bool | 
     with percent_bar() as progress:
         result = run_demo(model, out, seed, progress, spec, calibrate=calibrate)
     figures = result.to_json() | {"seconds": time.perf_counter() - start}
+    options = {"seed": seed, "source": spec, "calibrate": calibrate}
     for path in (out / "demo.json", json_path):
-        write_figures(path, figures, bundle=bundle_path(bundle), options={"seed": seed, "source": spec})
+        write_figures(path, figures, bundle=model, options=options)
     write_figure(result, out / "demo.png")
     click.echo(describe(result))
-    click.echo(f"\nwritten to {out}: demo.json, demo.png, pages.h5, pictures ({figures['seconds']:.0f} s)")
+    known = ", known.h5, device.zip" if calibrate else ""
+    click.echo(f"\nwritten to {out}: demo.json, demo.png, pages.h5, pictures{known} ({figures['seconds']:.0f} s)")
 
 
 def describe(result: DemoResult) -> str:

@@ -19,7 +19,7 @@ from lightpage.cli.options import JSON, named_profile, new_file, profile_option
 from lightpage.cli.paths import NewPath, OutputFile
 from lightpage.cli.progress_bar import percent_bar
 from lightpage.device.profile import Profile
-from lightpage.errors import InvalidInputError, LightpageError
+from lightpage.errors import CalibrationError, InvalidInputError, LightpageError
 from lightpage.files import replace_file, write_json
 from lightpage.pictures import write_figure_png
 from lightpage.progress import Progress, note, warn
@@ -28,7 +28,7 @@ from lightpage.runtime.archives.recordings.new_bundle import bundle_by_graphs, c
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.execution.twin import OnnxTwin
-from lightpage.runtime.recalibration.from_nominal import OtherGraphsWantedError, calibrate_by_graphs
+from lightpage.runtime.recalibration.from_nominal import calibrate_by_graphs
 
 _DOTS = 150
 """Dots of a picture in an inch."""
@@ -100,23 +100,25 @@ def calibrate(
         upright = orientation != "any"
         try:
             calibration = _calibrated(decoder, file, profile, chosen, progress, compute, upright=upright)
-        except OtherGraphsWantedError as error:
-            if graphs is not None:
+        except CalibrationError as error:
+            if decoder is None or graphs is not None:
                 raise
             note(f"{error.subject}: {error.got}; once more, with torch")
             decoder = None
-            calibration = _calibrated(decoder, file, profile, chosen, progress, compute, upright=upright)
-        seconds = time.perf_counter() - start
-        kept = calibration.is_wrong and _is_better(out)
-        if not kept:
-            calibration.save(out)
-        exported = None
-        if bundle is not None and not calibration.is_wrong:
-            exported = _exported(decoder, calibration, file, profile, bundle, progress)
+            try:
+                calibration = _calibrated(decoder, file, profile, chosen, progress, compute, upright=upright)
+            except CalibrationError:
+                raise
+            except LightpageError as lacking:
+                expected = f"{error.expected}, or torch for graphs of this device: {lacking}"
+                raise CalibrationError(error.subject, error.got, expected) from None
+    seconds = time.perf_counter() - start
+    kept = calibration.is_wrong and _is_better(out)
+    if not kept:
+        calibration.save(out)
     lost = _symbols_beside_cameras(decoder, calibration, profile)
     if json_path is not None:
-        version = None if exported is None else exported.version
-        write_json(json_path, figures(calibration, profile, seconds, lost) | {"bundle_version": version})
+        write_json(json_path, figures(calibration, profile, seconds, lost))
     click.echo(table(calibration, profile))
     if lost:
         total = profile.page.columns * profile.page.rows
@@ -133,10 +135,13 @@ def calibrate(
     )
     if found is not None and found.verdict == "good":
         click.echo(f"a good fit: about {found.bits_lost:.2f} bit a symbol lost to light that it does not explain")
-    if exported is not None:
-        click.echo(f"{bundle}: version {exported.version}, {time.perf_counter() - start:.0f} s")
     remedy = "the file keeps a better one: name another --out" if kept else "the file is there to be looked at"
-    calibration.check_good(f"calibration {out}", f"; {remedy}")
+    lacking = "" if bundle is None else f", and {bundle} is not written"
+    calibration.check_good(f"calibration {out}", f"; {remedy}{lacking}")
+    if bundle is not None:
+        with Recording.open(recording) as file, percent_bar() as progress:
+            exported = _exported(decoder, calibration, file, profile, bundle, progress)
+        click.echo(f"{bundle}: version {exported.version}, after {time.perf_counter() - start:.0f} s")
 
 
 def _calibrated(

@@ -37,8 +37,8 @@ class PageCodec:
         pilots: where the pilots are, bool [ny, nx].
         levels: levels of the pages that are read, where they are uneven; as many as the code has.
         threads: number of threads that share the work on a page where it is compiled.
-        earlier: codecs of codes with which other pages were written. A page is read with the code that its header
-            names.
+        earlier: codecs of codes of as many levels with which other pages were written. A page is read with the code
+            that its header names.
 
     Raises:
         InvalidInputError: the page is too small for this code.
@@ -169,12 +169,9 @@ class PageCodec:
             raise PageError("phase, concentration", shapes, f"{self.pilots.shape} twice, as the pilots have")
         mu, kappa = phase.ravel(), concentration.ravel()
         header = decode_header(mu[self._header], kappa[self._header], self._levels)
-        if header is None or header.code_id != self.code.id:
-            for codec in self._earlier.values():
-                found_earlier = codec.decode(phase, concentration, expected)
-                named = found_earlier.header
-                if named is not None and named.code_id == codec.code.id:
-                    return found_earlier
+        named = header or expected
+        if named is not None and named.code_id in self._earlier:
+            return self._earlier[named.code_id].decode(phase, concentration, expected)
         other = header is not None and header.code_id != self.code.id and expected is None
         own = mu[self._body].astype(np.float64)
         blocks = self._blocks(own, kappa[self._body])

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lightpage.calibration.calibrate import KnownPage, calibrate
+from lightpage.calibration.calibrate import KnownPage, Registered, calibrate
 from lightpage.calibration.document import BlemishCounts, Calibration
 from lightpage.calibration.known_pages import known_pages, without_blemishes
 from lightpage.calibration.likelihood.device_fit import DeviceFit
@@ -66,11 +66,8 @@ def calibrate_by_graphs(
     twin = OnnxTwin(decoder.bundle)
     device = twin, decoder.field_solver, profile, blemishes.references, known
     registered = calibrate(*device, progress, any_orientation=any_orientation)
-    lacking = {*apart_inputs(registered.parameters)} - decoder.graph.ports.keys()
-    if lacking or registered.conditions is None:
-        got = "cameras that see different planes, which the graphs do not allow for"
-        expected = "graphs of this device (lightpage calibrate --graphs none)"
-        raise OtherGraphsWantedError(f"{decoder.bundle.subject}: graphs", got, expected)
+    _check_planes(decoder, registered)
+    assert registered.conditions is not None  # its waves were fitted
     likelihood = GraphLikelihood(neutral_graph(decoder, blemishes))
     fit = DeviceFit(
         likelihood,
@@ -81,8 +78,21 @@ def calibrate_by_graphs(
         lambda share: progress("likelihood of all known pages", share),
     )
     refined, statistics = fit.refined(registered, registered.conditions)
+    _check_planes(decoder, refined)
     hashes = [recording.page_hash(page) for page in pages]
     return Calibration.from_registered(refined, profile, hashes, statistics, BlemishCounts.of(blemishes))
+
+
+def _check_planes(decoder: Decoder, registered: Registered) -> None:
+    """Check that graphs allow for the planes that the cameras see.
+
+    Raises:
+        OtherGraphsWantedError: the planes differ, and the graphs take no tensors of that.
+    """
+    if {*apart_inputs(registered.parameters)} - decoder.graph.ports.keys():
+        got = "cameras that see different planes, which the graphs do not allow for"
+        expected = "graphs of this device (lightpage calibrate --graphs none)"
+        raise OtherGraphsWantedError(f"{decoder.bundle.subject}: graphs", got, expected)
 
 
 def recorded_pages(recording: Recording, profile: Profile, pages: Sequence[int]) -> RecordedPages:

@@ -1,6 +1,7 @@
 """A bundle of a calibration alone reads its device's pages, with as many steps as it is asked for."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +52,7 @@ from lightpage.runtime.model.bundle.manifest import (
 from lightpage.runtime.model.decoding.batches import Batching
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
+from lightpage.runtime.model.decoding.page import Inference
 from lightpage.runtime.model.execution.estimator_graph import EXPECTED, EstimatorFiles, EstimatorGraph
 from lightpage.runtime.model.execution.session import open_session
 from lightpage.runtime.model.execution.table_graph import GraphFile
@@ -424,3 +426,22 @@ def test_expected_counts_alone_are_those_of_the_whole_step(bundle: Path, small_d
     evaluated = page, {}, page["p"], page["nuisance"]
     alone = graph.derivatives(*evaluated, (EXPECTED,))[EXPECTED]
     np.testing.assert_allclose(alone, graph.derivatives(*evaluated)[EXPECTED], rtol=1e-5)
+
+
+def test_a_page_that_few_steps_contradict_is_judged_by_all_of_them(bundle: Path, small_device: list[str]) -> None:
+    opened = Bundle.open(bundle)
+    with Recording.open(small_device[3]) as recording:
+        pair = recording.frames(2)
+    one, all_steps = (Decoder(opened, 1, steps=steps).infer(pair) for steps in (1, None))
+    assert one.steps == 1
+    assert all_steps.residual < one.residual
+    limit = (one.residual + all_steps.residual) / 2
+
+    def judged(limit: float) -> Inference:
+        strict = replace(opened, manifest=opened.manifest.model_copy(update={"residual_limit": limit}))
+        return Decoder(strict, 1, Decoder(opened, 1, steps=1).graph).infer(pair)
+
+    assert judged(limit).steps == 1 + STEPS
+    assert judged(limit).residual == all_steps.residual
+    with pytest.raises(FramesDisagreeError):
+        judged(all_steps.residual / 2)

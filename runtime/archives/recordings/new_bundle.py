@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from lightpage.calibration.document import Calibration
-from lightpage.calibration.likelihood.table import FLAT_FIELD, PIXEL_GAINS
+from lightpage.calibration.likelihood.table import FLAT_FIELD, PIXEL_GAINS, pilot_tensors
 from lightpage.device.profile import Profile
-from lightpage.errors import BundleError, CalibrationError, InvalidInputError, LightpageError
-from lightpage.progress import Progress, warn
+from lightpage.errors import BundleError, CalibrationError, InvalidInputError, LightpageError, ProfileError
+from lightpage.progress import Progress, note, warn
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import page_hashes
 from lightpage.recording.reader import Recording
@@ -39,9 +39,9 @@ def check_graphs(decoder: Decoder, recording: Recording) -> None:
     """Check that the graphs of a bundle can calibrate the device of a recording.
 
     Raises:
-        BundleError: the bundle's decoder is a network, or of a version before 0.3 and takes no gains of pixels.
+        BundleError: the bundle's decoder is a network, or takes no gains of pixels, as those of earlier versions.
         InvalidInputError: the recording has pilots at other places than the bundle.
-        RecordingError, ProfileError: another profile, frame shape or bit depth.
+        RecordingError, ProfileError: another frame shape, page or bit depth.
     """
     bundle = decoder.bundle
     if not isinstance(decoder.graph, EstimatorGraph):
@@ -78,15 +78,19 @@ def calibrating_decoder(graphs: str | None, recording: Recording, profile: Profi
         LightpageError: the named bundle does not fit; see `check_graphs`.
     """
     bundle = Bundle.open(bundle_path(DEFAULT if graphs is None else graphs))
-    if graphs is None and bundle.profile != profile:
-        return None
+    if bundle.profile != profile:
+        if graphs is None:
+            return None
+        got = f"profile {bundle.profile.name}, with other numbers than profile {profile.name} of the recording"
+        raise ProfileError(f"{bundle.subject}: profile", got, "the recording's profile")
     decoder = Decoder(bundle)
     try:
         check_graphs(decoder, recording)
-    except LightpageError:
-        if graphs is None:
-            return None
-        raise
+    except LightpageError as error:
+        if graphs is not None:
+            raise
+        note(f"not with the graphs of the shipped bundle: {error}")
+        return None
     return decoder
 
 
@@ -112,11 +116,12 @@ def bundle_by_graphs(
         progress: called at the beginning of each step, and with its finished share.
 
     Raises:
-        CalibrationError: the calibration has no statistics, or belongs to other pages or references.
+        CalibrationError: the calibration is wrong, has no statistics, or belongs to other pages or references.
         BundleError: `version` is malformed, or `out` cannot be written.
     """
     profile = decoder.bundle.profile
     calibration.check_profile(profile)
+    calibration.check_good("calibration")
     if (statistics := calibration.statistics) is None:
         raise CalibrationError("calibration: statistics", "none", "statistics of the counts: calibrate anew")
     used = calibrated_pages(calibration, recording)
@@ -130,6 +135,8 @@ def bundle_by_graphs(
     )
     result = traced(decoder, twin, blemishes.references, calibration, gains=blemishes.gains)
     result = replace(result, table={**result.table, **measured})
+    pilots = decoder.of_bundle(refitted_bundle(decoder.bundle, result)).pilots(256)
+    result = replace(result, table={**result.table, **pilot_tensors(pilots)})
     fitted = refitted_bundle(decoder.bundle, result)
     new = decoder.of_bundle(fitted)
     assert isinstance(new.graph, EstimatorGraph)  # as that of `decoder`
@@ -150,6 +157,7 @@ def bundle_by_graphs(
                 new.infer(pair, doubtful=True).residual, new.infer(swapped, doubtful=True).residual
             ),
             "code": None,
+            "earlier_codes": (),
             "provenance": Provenance(command=f"calibrated with the graphs of {decoder.version}"),
         }
     )

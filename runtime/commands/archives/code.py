@@ -102,9 +102,8 @@ def code(
         best.code.save(out)
     if out_bundle is not None:
         bundle = decoder.bundle
-        earlier = bundle.manifest.earlier_codes
-        if bundle.code is not None and bundle.code.id != best.code.id:
-            earlier = (*earlier, bundle.code.to_toml())
+        before = (*bundle.earlier_codes, *([] if bundle.code is None else [bundle.code]))
+        earlier = tuple({each.id: each.to_toml() for each in before if each.id != best.code.id}.values())
         update = {"code": best.code.to_toml(), "earlier_codes": earlier, "version": version}
         manifest = bundle.manifest.model_copy(update=update)
         write_bundle(out_bundle, manifest, bundle.files)

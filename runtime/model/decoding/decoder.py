@@ -6,7 +6,7 @@ import time
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -236,11 +236,7 @@ class Decoder:
                 feeds |= pilot_tensors(pilots)
             names = [*self._outputs, *(_OF_ESTIMATE if self._estimates else ())]
             with self.batches.alone:
-                answers = self.graph.run_whole(names, feeds) if alone else self.graph.run(names, feeds)
-            found = dict(zip(names, answers, strict=True))
-            page = _inference(found, self.bundle.manifest.residual_output)
-            if isinstance(self.graph, EstimatorGraph):
-                page = replace(page, steps=self.graph.steps)
+                page = _page_of(self.graph, names, feeds, self.bundle, alone=alone)
         check_residual(page.residual, self.bundle.manifest, doubtful=doubtful)
         return self.view.seen(page, table.get(REGISTRATION))
 
@@ -283,7 +279,8 @@ class Decoder:
         from lightpage.codec.page_codec import PageCodec
 
         bundle, threads = self.bundle, self.code_threads
-        own = [*bundle.earlier_codes, *([] if bundle.code is None else [bundle.code])]
+        codes = [*bundle.earlier_codes, *([] if bundle.code is None else [bundle.code])]
+        own = [each for each in codes if each.levels == code.levels]  # others have other pilots
         codecs = [PageCodec(each, bundle.pilot_mask, bundle.levels(each.levels), threads) for each in own]
         return PageCodec(code, bundle.pilot_mask, bundle.levels(code.levels), threads, codecs)
 
@@ -350,6 +347,27 @@ class Decoder:
 
 _OF_ESTIMATE = ("nuisance", RESIDUAL)
 """Further outputs of an estimator."""
+
+
+def _page_of(
+    graph: PageGraph, names: list[str], feeds: dict[str, NDArray[Any]], bundle: Bundle, *, alone: bool
+) -> Inference:
+    """Run a graph on a page.
+
+    Chi-square belongs to the estimate before the last step. With few steps it may exceed the limit for right frames.
+    Such a page is estimated again with all steps of the bundle, and judged by them.
+    """
+    residual = bundle.manifest.residual_output
+    run = graph.run_whole if alone else graph.run
+    page = _inference(dict(zip(names, run(names, feeds), strict=True)), residual)
+    if not isinstance(graph, EstimatorGraph):
+        return page
+    limit, most = bundle.manifest.residual_limit, graph.steps if alone else graph.most_steps
+    if limit is None or not page.residual > limit or graph.steps == most:
+        return replace(page, steps=graph.steps)
+    answers = graph.run_whole(names, feeds)
+    whole = _inference(dict(zip(names, answers, strict=True)), residual)
+    return replace(whole, steps=graph.steps + most)
 
 
 def _inference(found: dict[str, NDArray[np.float32]], residual: str | None) -> Inference:

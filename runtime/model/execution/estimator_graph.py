@@ -98,7 +98,8 @@ class EstimatorGraph:
         ports: type and shape of every tensor of the table, by name.
         table: tensors that replace their defaults, by name.
         provider: execution provider of the pages' graphs.
-        steps: number of steps.
+        most_steps: number of steps that the bundle has.
+        steps: number of steps that a page gets.
 
     Raises:
         InvalidInputError: a tensor of `table` has an unknown name, a wrong type or shape, or values that are not
@@ -127,8 +128,8 @@ class EstimatorGraph:
         self.table: SamplingTable = table or {}
         check_table(self.ports, self.table)
         self._limit = steps
-        most = most_steps(self.ports, subject)
-        self.steps = most if steps is None else min(steps, most)
+        self.most_steps = most_steps(self.ports, subject)
+        self.steps = self.most_steps if steps is None else min(steps, self.most_steps)
         if like is None:
             held = files.constants
             self._operators = open_session(files.operators, f"{subject}: operators", threads, once=True, constants=held)
@@ -245,7 +246,7 @@ class EstimatorGraph:
 
     def run_whole(self, outputs: Sequence[str], feeds: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
         """Estimate a page with all steps of the bundle, whatever `self.steps` is; see `run`."""
-        return self.run(outputs, feeds, len(self.value(NOISE)) - 1)
+        return self.run(outputs, feeds, self.most_steps)
 
     def derivatives(
         self,
