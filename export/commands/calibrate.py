@@ -136,8 +136,8 @@ def calibrate(
     if found is not None and found.verdict == "good":
         click.echo(f"a good fit: about {found.bits_lost:.2f} bit a symbol lost to light that it does not explain")
     remedy = "the file keeps a better one: name another --out" if kept else "the file is there to be looked at"
-    lacking = "" if bundle is None else f", and {bundle} is not written"
-    calibration.check_good(f"calibration {out}", f"; {remedy}{lacking}")
+    without = "" if bundle is None else f", and {bundle} is not written"
+    calibration.check_good(f"calibration {out}", f"; {remedy}{without}")
     if bundle is not None:
         with Recording.open(recording) as file, percent_bar() as progress:
             exported = _exported(decoder, calibration, file, profile, bundle, progress)

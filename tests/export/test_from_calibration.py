@@ -19,7 +19,14 @@ from lightpage.cli.simulate import simulate
 from lightpage.codec.code import load_code
 from lightpage.codec.page_codec import PageCodec
 from lightpage.device.state import Device
-from lightpage.errors import BundleError, CalibrationError, FrameError, FramesDisagreeError, InvalidInputError
+from lightpage.errors import (
+    BundleError,
+    CalibrationError,
+    FrameError,
+    FramesDisagreeError,
+    InvalidInputError,
+    ProfileError,
+)
 from lightpage.export import from_calibration, proof
 from lightpage.export.commands.calibrate import calibrate
 from lightpage.export.from_calibration import export_calibration
@@ -406,6 +413,8 @@ def test_a_network_calibrates_no_other_device_and_a_gpu_needs_torch(
         run(calibrate, *common, "--graphs", small_bundle)
     with pytest.raises(InvalidInputError, match="--graphs"):
         run(calibrate, *common, "--graphs", bundle, "--compute", "cuda")
+    with pytest.raises(ProfileError, match="profile bench"):
+        run(calibrate, *common, "--graphs", "bench")
     assert not list(tmp_path.iterdir())
 
 

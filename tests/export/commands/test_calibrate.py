@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from lightpage.progress import reporting
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
 from lightpage.recording.writer import RecordingWriter
+from lightpage.runtime.recalibration.from_nominal import OtherGraphsWantedError
 from tests.lightpage.small import EXPLAINED, UNEXPLAINED
 from tests.told import Told
 
@@ -190,3 +192,22 @@ def test_a_camera_that_is_mounted_otherwise_is_named(
     with pytest.raises(CalibrationError, match=named):
         run(recorded[0], tmp_path / "C.toml", "--pages", "1")
     assert not (tmp_path / "C.toml").exists()
+
+
+def test_a_device_that_the_shipped_graphs_do_not_allow_for_is_calibrated_with_torch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object, **__: object) -> Calibration:
+        raise OtherGraphsWantedError("graphs", "cameras that see different planes", "graphs of this device")
+
+    recording = flat_recording(tmp_path / "R.h5", 100)
+    fake_registration(monkeypatch, REGISTERED)
+    monkeypatch.setattr("lightpage.export.commands.calibrate.calibrating_decoder", lambda *_: object())
+    monkeypatch.setattr("lightpage.export.commands.calibrate.calibrate_by_graphs", refuse)
+    with pytest.raises(OtherGraphsWantedError):
+        run(recording, tmp_path / "named.toml", "--graphs", "bench")
+    assert "different planes" in run(recording, tmp_path / "C.toml")
+    assert load_calibration(tmp_path / "C.toml").angle_deg(load_profile("bench")) == pytest.approx(-0.6)
+    monkeypatch.setitem(sys.modules, "lightpage.train.trainers.calibration", None)
+    with pytest.raises(CalibrationError, match=r"different planes.*torch"):
+        run(recording, tmp_path / "D.toml")
