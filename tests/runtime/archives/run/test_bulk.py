@@ -11,10 +11,10 @@ from unittest.mock import Mock
 import h5py
 import pytest
 
+from lightpage.codec import page_codec
 from lightpage.codec.page_codec import PageCodec
 from lightpage.errors import StorageError
 from lightpage.recording.reader import Recording
-from lightpage.runtime.archives.recordings import page_reader
 from lightpage.runtime.archives.recordings.evaluation import evaluate
 from lightpage.runtime.archives.run.driver import AGAIN_S
 from lightpage.runtime.archives.run.ledger import Ledger
@@ -108,7 +108,7 @@ def test_a_recording_that_opens_at_the_second_try_costs_a_second(
 
 
 def test_files_come_back_from_pages_in_several_recordings(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(page_reader, "PageCodec", codec := Mock(wraps=PageCodec))
+    monkeypatch.setattr(page_codec, "PageCodec", codec := Mock(wraps=PageCodec))
     _, options = archive.shows_a_file({2: coded.dark})
     status, figures = archive.run("recover", *options, "--code-threads", "3")
     assert {call.args[3] for call in codec.call_args_list} == {3}
