@@ -45,7 +45,7 @@ $(STAMP): $(SOURCES)
 READING := $(VENV)/.installed-reading
 $(READING): $(SOURCES)
 	@test ! -e $(STAMP) || $(MAKE) --no-print-directory $(STAMP)
-	@test -e $(STAMP) || echo "installing what reads pages into $(VENV): 0.4 GB, in about a minute"
+	@test -e $(STAMP) || echo "installing what reads pages into $(VENV): 0.5 GB, in about a minute"
 	$(environment)
 	@test -e $(STAMP) || $(BIN)/pip install --quiet --constraint constraints.txt --editable '.[cpu]'
 	@$(BIN)/lightpage --version

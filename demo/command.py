@@ -34,7 +34,7 @@ from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 )
 @JSON
 def demo(bundle: str, out: Path, seed: int, spec: str | None, calibrate: bool | None, json_path: Path | None) -> None:
-    """Calibrate a simulated device, store a picture on it, and read it before a drift, after it and healed by it.
+    """Calibrate a simulated device, store a picture, and read it before a drift, after it and after a healing.
 
     Writes to the folder --out: known.h5 (two known pages), device.zip (the bundle made of them), pages.h5 (what the
     modulator shows), demo.json, demo.png, and the picture as it was read in each state (.pgm).

@@ -1,8 +1,8 @@
 """The main job on the simulated device: it is calibrated, then a picture goes through a service while it drifts.
 
 Two known pages calibrate the device. The picture's bytes are encoded on pages in two groups, and one page is spoilt.
-The service reads them all: as the device was calibrated, after a drift that loses them, and healed by the pages that
-it lost.
+The service reads all pages three times: after the calibration, after a drift that loses them, and after a healing by
+the lost pages.
 """
 
 from __future__ import annotations

@@ -5,16 +5,14 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-from lightpage.errors import BundleError, InvalidInputError
-from lightpage.progress import Progress, warn
+from lightpage.errors import BundleError
+from lightpage.progress import Progress
 from lightpage.recording.reader import Recording
-from lightpage.runtime.archives.recordings.coded_pages import choose_code
-from lightpage.runtime.archives.recordings.evaluation import check_recording
+from lightpage.runtime.archives.recordings.new_bundle import with_code
 from lightpage.runtime.model.bundle.bundle import write_bundle
 from lightpage.runtime.model.bundle.manifest import Manifest, check_version
 from lightpage.runtime.model.decoding.batch_graph import with_proven_batches
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.model.decoding.image_tracker import tracker_for
 
 
 def check_new(out: Path, version: str | None) -> None:
@@ -50,12 +48,7 @@ def proven(
         if recording is not None:
             progress("choose the code of user bytes", 0.9)
             with Recording.open(recording) as pages:
-                check_recording(decoder, pages)
-                try:
-                    best, _ = choose_code(decoder, pages, tracker_for(decoder))
-                    manifest = manifest.model_copy(update={"code": best.code.to_toml()})
-                except InvalidInputError as lacking:
-                    warn(f"no code for user bytes: {lacking}")
+                manifest = with_code(decoder, pages, manifest)
     finally:
         _remove(partial)
     return manifest, files

@@ -41,7 +41,7 @@ def check_graphs(decoder: Decoder, recording: Recording) -> None:
     Raises:
         BundleError: the bundle's decoder is a network, or takes no gains of pixels, as those of earlier versions.
         InvalidInputError: the recording has pilots at other places than the bundle.
-        RecordingError, ProfileError: another frame shape, page or bit depth.
+        RecordingError: another frame shape, page or bit depth.
     """
     bundle = decoder.bundle
     if not isinstance(decoder.graph, EstimatorGraph):
@@ -162,7 +162,7 @@ def bundle_by_graphs(
         }
     )
     new = decoder.of_bundle(replace(fitted, manifest=manifest))
-    manifest = _with_code(new, recording, manifest)
+    manifest = with_code(new, recording, manifest)
     golden, p = golden_page(new, pair)
     progress("write the bundle", 0.9)
     files = {**fitted.files, GOLDEN: npz(in_phase=golden.in_phase, quadrature=golden.quadrature, p=p)}
@@ -189,8 +189,12 @@ def calibrated_pages(calibration: Calibration, recording: Recording) -> list[int
     return known[-MOST_PAGES:]
 
 
-def _with_code(decoder: Decoder, recording: Recording, manifest: Manifest) -> Manifest:
-    """Return the manifest with a code of user bytes, where the recording's pages allow one."""
+def with_code(decoder: Decoder, recording: Recording, manifest: Manifest) -> Manifest:
+    """Return the manifest with a code of user bytes; as it is, with a warning, where the pages allow none.
+
+    Raises:
+        RecordingError: the recording is of another device.
+    """
     try:
         choice, _ = choose_code(decoder, recording, tracker_for(decoder))
     except InvalidInputError as lacking:

@@ -278,7 +278,8 @@ class Decoder:
         """Codec of this device's pages with a code that fits them. It also reads pages of the bundle's own codes."""
         from lightpage.codec.page_codec import PageCodec
 
-        bundle, threads = self.bundle, self.code_threads
+        bundle = self.bundle
+        threads = self.code_threads
         codes = [*bundle.earlier_codes, *([] if bundle.code is None else [bundle.code])]
         own = [each for each in codes if each.levels == code.levels]  # others have other pilots
         codecs = [PageCodec(each, bundle.pilot_mask, bundle.levels(each.levels), threads) for each in own]
@@ -362,12 +363,11 @@ def _page_of(
     page = _inference(dict(zip(names, run(names, feeds), strict=True)), residual)
     if not isinstance(graph, EstimatorGraph):
         return page
-    limit, most = bundle.manifest.residual_limit, graph.steps if alone else graph.most_steps
-    if limit is None or not page.residual > limit or graph.steps == most:
+    limit = bundle.manifest.residual_limit
+    if alone or limit is None or not page.residual > limit or graph.steps == graph.most_steps:
         return replace(page, steps=graph.steps)
-    answers = graph.run_whole(names, feeds)
-    whole = _inference(dict(zip(names, answers, strict=True)), residual)
-    return replace(whole, steps=graph.steps + most)
+    whole = _inference(dict(zip(names, graph.run_whole(names, feeds), strict=True)), residual)
+    return replace(whole, steps=graph.steps + graph.most_steps)
 
 
 def _inference(found: dict[str, NDArray[np.float32]], residual: str | None) -> Inference:

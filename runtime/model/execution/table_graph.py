@@ -167,8 +167,8 @@ def with_outputs(model: bytes, names: Collection[str]) -> bytes:
     reduced = pb.Model.FromString(model)
     graph = reduced.graph
     nodes = _needed(list(graph.node), set(names))
-    taken = {name for node in nodes for name in node.input}
-    inputs = [entry for entry in graph.input if entry.name in taken]
+    used = {name for node in nodes for name in node.input}
+    inputs = [entry for entry in graph.input if entry.name in used]
     _keep(reduced, nodes, inputs, [entry for entry in graph.output if entry.name in names])
     return reduced.SerializeToString()
 
