@@ -87,7 +87,7 @@ class Manifest(BaseModel):
 
     def to_json(self) -> bytes:
         """The manifest as JSON with a hash of itself, so that a damaged manifest is noticed like any other file."""
-        # readers of before know no earlier codes
+        # earlier programs know no such field, and refuse it
         data = self.model_dump(mode="json", exclude=None if self.earlier_codes else {"earlier_codes"})
         return (json.dumps(data | {_SELF_HASH: _digest(data)}, indent=2, sort_keys=True) + "\n").encode()
 

@@ -256,7 +256,7 @@ class EstimatorGraph:
         nuisance: NDArray[np.float32],
         outputs: Sequence[str] = DERIVATIVES,
     ) -> dict[str, NDArray[Any]]:
-        """Evaluate a step at an estimate.
+        """Evaluate a step at an estimate. Expected counts alone are computed without the rest of the step.
 
         Args:
             page: measurements of the page and deviations, see `first_estimate`.
