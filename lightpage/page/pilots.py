@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import i0e
+from scipy.special import hyp1f1, i0e
 
 from lightpage.device.profile import Profile
 from lightpage.errors import PageError
@@ -15,8 +15,12 @@ from lightpage.page.symbols import pilot_mask, pilot_symbols, symbol_phases
 from lightpage.von_mises import information, mean_resultant
 from lightpage.words import brief, sides
 
-_CREDIT = 20.0
-"""Pilots that count for the decoder before any is seen: noise of 54 pilots then costs under 0.01 bit a symbol."""
+_OVER_CLAIM_ODDS = 0.3
+"""Odds that claims are too large by a given factor, for each e-fold of the factor, over that they are right, before any
+pilot is read. The errors of 54 pilots then cost 0.001 bit a symbol where claims are right, and 0.03 where they are not.
+"""
+_LEAST_MISSED = 1e-6
+"""Least error of the pilots over what their claims allow: less is rounding."""
 
 _OUTLIERS = 0.01
 """Share of pilots that are expected to say nothing: a dead place of the modulator, a value that was not written."""
@@ -181,8 +185,9 @@ def estimate_trust(p: NDArray[np.floating], pilots: Pilots, angle_rad: float) ->
     """Factor on the claimed concentrations that the pilots bear out, 0 to 1.
 
     Twice kappa (1 - cos error), summed over n pilots whose piston they gave themselves, is about n - 1 where the claims
-    are true. A device that has drifted shows more; the pilots are then most likely under claims that are smaller by as
-    much. The decoder starts with the credit of `_CREDIT` pilots, and gets no more than it claims.
+    are true. A device that has drifted shows more. The factor is the posterior mean of claims that are either right, or
+    too large by a factor whose logarithm has an even density (`_OVER_CLAIM_ODDS`). Thus chance takes little from right
+    claims, and wrong ones are taken back in full.
 
     Args:
         p: (px, py), [2, ny, nx].
@@ -193,7 +198,16 @@ def estimate_trust(p: NDArray[np.floating], pilots: Pilots, angle_rad: float) ->
         PageError: the page has another shape than the pilots.
     """
     missed = _missed(_errors(p, pilots), angle_rad)
-    return min(1.0, (_CREDIT + len(missed) - 1) / (_CREDIT + float(missed.sum())))
+    if len(missed) < 2:
+        return 1.0
+    shape = (len(missed) - 1) / 2
+    rate = max(float(missed.sum()) / 2, _LEAST_MISSED * shape)
+    with np.errstate(over="ignore"):
+        # integral of t^(shape - 1) exp(rate (1 - t)) over factors t from 0 to 1
+        over_right = hyp1f1(1, shape + 1, rate) / shape
+    right = 1 / (1 + _OVER_CLAIM_ODDS * over_right)
+    if_wrong = (shape - 1 / over_right) / rate
+    return float(right + (1 - right) * if_wrong)
 
 
 def check_claims(

@@ -122,7 +122,8 @@ class DeviceFit:
             conditions: illumination and blur of its pages.
 
         Returns:
-            The registration with refined parameters and their verdict, and the statistics of the pages' counts.
+            The registration with refined parameters and their verdict, and the statistics of the pages' counts. The
+            parameters include the mean tilt and shift of the pages, whose likelihood is that of such parameters.
 
         Raises:
             CalibrationError: the pages' light does not agree with the device.
@@ -150,16 +151,16 @@ class DeviceFit:
                 break
         goodness = self._goodness(current, conditions, fit.pages[0])
         self._progress(1.0)
-        return replace(current, goodness=goodness), statistics
+        at_mean = _at_page(current.parameters, np.mean([page.nuisance for page in fit.pages], axis=0))
+        parameters = np.where(registered.deviations > 0, at_mean, current.parameters)
+        return replace(current, parameters=parameters, goodness=goodness), statistics
 
     def _goodness(self, registered: Registered, conditions: LaunchConditions, page: FittedPage) -> Goodness:
         """Judge a registration by the light of its first page, with the gain, tilt and shift of `page`."""
         illumination = conditions.illumination
         launched = conditions._replace(illumination=illumination * (page.gain * abs(illumination[0]) / illumination[0]))
         known = self._pages[0]
-        parameters = moved_cameras(registered.parameters, page.nuisance[SHIFT])
-        parameters[_CAMERA_TILTS] += page.nuisance[TILT]
-        moved = replace(registered, parameters=parameters)
+        moved = replace(registered, parameters=_at_page(registered.parameters, page.nuisance))
         return measure_goodness(self._twin, self._device(moved), launched, known.pair, known.symbols)
 
     def _device(self, registered: Registered) -> CalibratedDevice:
@@ -292,6 +293,13 @@ class DeviceFit:
             # the inverse of an orientation is its transpose
             derivatives.append(np.einsum("acn,cni,cia->cn", by_shift, displacement, to_image))
         return derivatives
+
+
+def _at_page(parameters: Real, nuisance: Real) -> Real:
+    """Parameters [P] of a device that sees its light where a page's tilt and shift, of `nuisance` [6], take it."""
+    moved = moved_cameras(parameters, nuisance[SHIFT])
+    moved[_CAMERA_TILTS] += nuisance[TILT]
+    return moved
 
 
 def _other_steps(table: SamplingTable, turn_rad: float, blur: float) -> list[tuple[SamplingTable, float]]:

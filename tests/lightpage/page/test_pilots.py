@@ -93,11 +93,34 @@ class TestTrust:
         for seed in range(40):
             p, pilots = noisy(kappa, claim, seed)
             found.append(estimate_trust(p, pilots, estimate_piston(p, pilots).angle_rad))
-        # n pilots show n - 1 times the over-claim; the credit of 20 more pulls that towards one
+        # 2 kappa (1 - cos error) is 1 on average for errors of a large concentration, less for others
         over = 1 if claim == kappa else claim / (kappa - 0.5 if kappa > 4 else kappa * 0.86)
-        expected = min(1, 73 / (20 + 53 * over))
-        assert np.median(found) == pytest.approx(expected, rel=0.1)
+        assert np.median(found) == pytest.approx(1 / over, rel=0.1)
         assert max(found) <= 1
+
+    def test_chance_takes_little_from_right_claims(self) -> None:
+        pages = [noisy(400, 400, seed) for seed in range(200)]
+        trusts = [estimate_trust(p, pilots, estimate_piston(p, pilots).angle_rad) for p, pilots in pages]
+        assert np.mean(trusts) > 0.96
+
+    def test_the_trust_is_a_posterior_mean(self) -> None:
+        p, pilots = noisy(400, 600, 1)
+        angle = estimate_piston(p, pilots).angle_rad
+        errors = p[0][pilots.mask] + 1j * p[1][pilots.mask]
+        errors *= np.exp(-1j * (angle + pilots.phases))
+        missed = 2 * np.sum(np.abs(errors) - errors.real)
+        factors = np.exp(np.linspace(-12, 0, 20_001))
+        density = factors ** ((len(errors) - 1) / 2) * np.exp(missed / 2 * (1 - factors))
+        over = 0.3 * np.trapezoid(density, np.log(factors))
+        mean = 0.3 * np.trapezoid(density * factors, np.log(factors))
+        assert estimate_trust(p, pilots, angle) == pytest.approx((1 + mean) / (1 + over), rel=1e-4)
+
+    def test_one_pilot_tells_nothing(self) -> None:
+        p, pilots = noisy(400, 400, 0)
+        mask = np.zeros_like(pilots.mask)
+        mask.flat[np.flatnonzero(pilots.mask)[0]] = True
+        one = Pilots(mask, pilots.phases[:1])
+        assert estimate_trust(p, one, estimate_piston(p, one).angle_rad) == 1
 
     @pytest.mark.parametrize(("kappa", "outliers", "off_rad"), [(100, 1, 1.5), (1000, 2, np.pi), (4000, 2, 1.5)])
     def test_few_dead_places_cost_nothing(self, kappa: float, outliers: int, off_rad: float) -> None:
