@@ -33,6 +33,7 @@ from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.page import DecodedPage
 from lightpage.runtime.model.decoding.tracking import NoTracker
 from lightpage.runtime.model.decoding.turns import Turn
+from lightpage.runtime.model.execution.step_times import StepLimit
 from lightpage.runtime.service.caller import Call, Caller
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.models.loader import Loader
@@ -51,7 +52,12 @@ class _Disbelief(NoTracker):
         self._page = decoder.decode(pair)
 
     def decode(
-        self, pair: FramePair, levels: int, pilots: Pilots | None = None, turn: Turn | None = None
+        self,
+        pair: FramePair,
+        levels: int,
+        pilots: Pilots | None = None,
+        turn: Turn | None = None,
+        limit: StepLimit | None = None,
     ) -> DecodedPage:
         """See `Tracker`."""
         copies = {name: getattr(self._page, name).copy() for name in ("symbols", "phase", "concentration")}

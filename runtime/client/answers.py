@@ -25,6 +25,7 @@ class RemoteTimings:
         inference_s: all inferences, a part of `decode_s`.
         total_s: everything, waiting for a free slot included.
         steps: number of Gauss-Newton steps of all inferences; 0 for a network's bundle, and from services before 0.2.
+        skipped_steps: number of steps that these inferences lack, since the caller's time was short.
     """
 
     receive_s: float
@@ -32,6 +33,7 @@ class RemoteTimings:
     inference_s: float
     total_s: float
     steps: int = 0
+    skipped_steps: int = 0
 
 
 @dataclass(frozen=True)
@@ -209,6 +211,8 @@ class Description:
     user_bytes_per_page: int
     default_levels: int
     """Level count that `levels` 0 stands for where no user bytes are asked for."""
+    steps_s: tuple[float, ...]
+    """Usual time of a page's inference with 1, 2, ... Gauss-Newton steps, seconds; empty for a network."""
     limits: ServiceLimits
 
     def __repr__(self) -> str:

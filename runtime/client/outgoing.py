@@ -27,6 +27,8 @@ class PageOptions(TypedDict, total=False):
         session: of the pages that this one is followed with; by default those of the connection, at a Unix socket those
             of the client, or of the device where the service reads the page.
         stateless: decode the page as if it were the first, so that the same frames give the same answer.
+        least_steps: fewest Gauss-Newton steps of the page, where the time until the deadline is too short for all; by
+            default all steps of the model.
         correlation_id: a text that the page and the log have.
     """
 
@@ -36,6 +38,7 @@ class PageOptions(TypedDict, total=False):
     user_data: bool
     session: str
     stateless: bool
+    least_steps: int
     correlation_id: str
 
 

@@ -65,8 +65,8 @@ class Slots:
         self._lock = threading.Lock()
         self._free = count
         self._queue: deque[_Ticket] = deque()
-        self._lately: deque[tuple[float, float]] = deque(maxlen=REMEMBERED)
-        """When calls ended, and how long they took, seconds."""
+        self._lately: deque[tuple[float, float, float]] = deque(maxlen=REMEMBERED)
+        """When calls ended, how long they took, and how much longer they would have taken with all steps, seconds."""
 
     @property
     def queued(self) -> int:
@@ -83,8 +83,14 @@ class Slots:
     @property
     def usual_s(self) -> float:
         """Return what a slot was lately held for, the median in seconds; 0 where nothing was done lately."""
-        taken = self._taken()
+        taken = self._taken(whole=False)
         return median(taken) if taken else 0.0
+
+    @property
+    def needed_s(self) -> float:
+        """Time that the work with all steps hardly ever exceeds; 0 where nothing was done lately."""
+        taken = self._taken(whole=True)
+        return max(MARGIN * median(taken), taken[ceil(SLOW * len(taken)) - 1]) if taken else 0.0
 
     def expected_wait_s(self) -> float:
         """Return how long whoever comes now will wait for a slot, seconds."""
@@ -92,18 +98,27 @@ class Slots:
             ahead = len(self._queue) + (0 if self._free > 0 else 1)
         return self.usual_s * ahead / self.count
 
-    def check(self, caller: Caller) -> None:
+    def check(self, caller: Caller, optional_s: float = 0.0) -> None:
         """Turn a caller away for whom it would be too late, before anything is spent on the call.
+
+        Args:
+            caller: who waits.
+            optional_s: part of the work's time that may be left out for this caller, seconds.
 
         Raises:
             OverloadedError: the queue is too long, or the caller's deadline shorter than the work takes.
         """
         wait_s, left_s = self.expected_wait_s(), caller.seconds_left()
-        if wait_s + self._needed_s > left_s:
-            raise self._too_late(left_s, wait_s, in_queue=wait_s > 0)
+        needed_s = max(0.0, self.needed_s - optional_s)
+        if wait_s + needed_s > left_s:
+            raise self._too_late(left_s, wait_s, needed_s, in_queue=wait_s > 0)
 
-    def take(self, caller: Caller) -> None:
+    def take(self, caller: Caller, optional_s: float = 0.0) -> None:
         """Take a slot, waiting as long as the caller does, but not for one who has gone.
+
+        Args:
+            caller: who waits.
+            optional_s: see `check`.
 
         Raises:
             OverloadedError: too little of the caller's time is left to do the work.
@@ -121,9 +136,10 @@ class Slots:
         if queues := not ticket.has_slot:
             self._wait(ticket, caller)
         left_s = caller.seconds_left()
-        if self._needed_s > left_s:
+        needed_s = max(0.0, self.needed_s - optional_s)
+        if needed_s > left_s:
             self.give_back()
-            raise self._too_late(left_s, 0.0, in_queue=queues)
+            raise self._too_late(left_s, 0.0, needed_s, in_queue=queues)
 
     def give_back(self) -> None:
         """Give back a slot that was taken: whoever has waited longest gets it."""
@@ -147,9 +163,9 @@ class Slots:
             ticket.told.set()
 
     @contextmanager
-    def held(self, caller: Caller) -> Iterator[None]:
-        """Hold a slot in a `with` statement; raises as `take`."""
-        self.take(caller)
+    def held(self, caller: Caller, optional_s: float = 0.0) -> Iterator[None]:
+        """Hold a slot in a `with` statement; see `take`."""
+        self.take(caller, optional_s)
         try:
             yield
         finally:
@@ -171,22 +187,21 @@ class Slots:
         finally:
             self.give_back()
 
-    def took(self, seconds: float) -> None:
-        """Learn from work that was done how long it usually takes."""
+    def took(self, seconds: float, skipped_s: float = 0.0) -> None:
+        """Learn from work that was done how long it usually takes.
+
+        Args:
+            seconds: time that it took.
+            skipped_s: time that steps which were left out would have taken, seconds.
+        """
         with self._lock:
-            self._lately.append((self._clock.now(), seconds))
+            self._lately.append((self._clock.now(), seconds, skipped_s))
 
-    @property
-    def _needed_s(self) -> float:
-        """Time that the work hardly ever exceeds; 0 where nothing was done lately."""
-        taken = self._taken()
-        return max(MARGIN * median(taken), taken[ceil(SLOW * len(taken)) - 1]) if taken else 0.0
-
-    def _taken(self) -> list[float]:
-        """Return what was lately taken, the shortest first."""
+    def _taken(self, *, whole: bool) -> list[float]:
+        """Return what was lately taken, the shortest first; `whole`: what all steps would have taken."""
         since = self._clock.now() - FORGET_S
         with self._lock:
-            return sorted(seconds for ended, seconds in self._lately if ended >= since)
+            return sorted(seconds + whole * skipped for ended, seconds, skipped in self._lately if ended >= since)
 
     def _wait(self, ticket: _Ticket, caller: Caller) -> None:
         with caller.telling(ticket.told.set):
@@ -202,9 +217,9 @@ class Slots:
             expected = "a free one within the deadline; try again later"
             raise SlotsTakenError(f"concurrent {self._what}", "all taken", expected, retry_s=self.expected_wait_s())
 
-    def _too_late(self, left_s: float, wait_s: float, *, in_queue: bool) -> OverloadedError:
+    def _too_late(self, left_s: float, wait_s: float, work_s: float, *, in_queue: bool) -> OverloadedError:
         """The error of a caller who comes too late; without a queue, coming again with that deadline is of no use."""
-        needed_s, left_s = wait_s + self._needed_s, max(0.0, left_s)
+        needed_s, left_s = wait_s + work_s, max(0.0, left_s)
         subject, told = f"concurrent {self._what}", f"{left_s:.2f} s until the deadline"
         if not in_queue:
             return OverloadedError(subject, told, f"at least {needed_s:.2f} s")

@@ -4,7 +4,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -28,9 +28,10 @@ from lightpage.page.pilots import Pilots
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.device.acquisition.source import FrameSource
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.model.decoding.page import DecodedPage
+from lightpage.runtime.model.decoding.page import DecodedPage, Timings
 from lightpage.runtime.model.decoding.tracking import Tracker, unconfirmed_page
 from lightpage.runtime.model.decoding.turns import Turn
+from lightpage.runtime.model.execution.step_times import StepLimit
 from lightpage.runtime.service.admission import Heart, ReceiveBudget, Slots
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.limits import Limits
@@ -138,10 +139,12 @@ class Place:
     Attributes:
         tracker: follows them.
         turn: turn of the page.
+        limit: limit on the time of its steps, None where all are taken.
     """
 
     tracker: Tracker
     turn: Turn
+    limit: StepLimit | None
 
 
 class DataPlane:
@@ -194,6 +197,7 @@ class DataPlane:
         models.in_service = self._in_service
         self._in_service(models.current)
         self.metrics.watch_load(self.decodes, self.received)
+        self.metrics.watch_steps(self.steps_s)
         if models.store.folder.is_kept:
             self.metrics.watch_store(models.store.health, models.store.known_trouble)
         if source is not None:
@@ -221,6 +225,11 @@ class DataPlane:
     def together(self) -> int:
         """Pages that the model in service may compute together, 1 for none."""
         return self.models.current.decoder.batches.largest
+
+    def steps_s(self) -> list[float]:
+        """Usual inference with 1, 2, ... steps of the model in service, seconds; none for a network."""
+        graph = self.models.current.decoder.graph
+        return [graph.times.seconds(steps) for steps in range(1, graph.steps + 1)]
 
     def ahead(self, alone: int = 1) -> int:
         """Pages of one call that are on their way at a time: so many `alone`, or else a batch and the next one.
@@ -295,12 +304,40 @@ class DataPlane:
 
         return still
 
+    def check_time(self, caller: Caller) -> None:
+        """Turn a caller away for whom a page would come too late; see `Slots.check`."""
+        self.decodes.check(caller, self._optional_s(caller))
+
+    def slot(self, caller: Caller) -> AbstractContextManager[None]:
+        """Hold a slot for a page in a `with` statement; see `Slots.take`."""
+        return self.decodes.held(caller, self._optional_s(caller))
+
+    def took(self, model: Model, seconds: float, timings: Timings) -> None:
+        """Learn from a page how long pages take, without what it waited for its turn."""
+        skipped_s = timings.skipped_steps * model.decoder.graph.times.step_s
+        self.decodes.took(seconds - timings.turn_s, skipped_s)
+
+    def _optional_s(self, caller: Caller) -> float:
+        """Time of the steps that may be left out for a caller, seconds."""
+        graph = self.models.current.decoder.graph
+        if not caller.least_steps:
+            return 0.0
+        return graph.times.seconds(graph.steps) - graph.times.seconds(min(caller.least_steps, graph.steps))
+
+    def _limit(self, model: Model, caller: Caller) -> StepLimit | None:
+        """Limit on the time of a page's steps, where its caller takes fewer than all."""
+        if not caller.least_steps:
+            return None
+        graph = model.decoder.graph
+        behind_s = max(0.0, self.decodes.needed_s - graph.times.seconds(graph.steps))
+        return StepLimit(caller.least_steps, lambda: caller.seconds_left() - behind_s)
+
     @contextmanager
     def place(self, model: Model, caller: Caller) -> Iterator[Place]:
         """The place of a caller's page behind all that have one; it is left at the end of the `with` statement."""
         tracker = model.tracker_for(caller)
         with closing(tracker.turn(self.waiting(caller))) as turn:
-            yield Place(tracker, turn)
+            yield Place(tracker, turn, self._limit(model, caller))
 
     def decode(
         self,
@@ -323,7 +360,7 @@ class DataPlane:
         stages.begin(Stage.INFERENCE)
         try:
             with self.heart.at_work():
-                page = place.tracker.decode(pair, levels, pilots, place.turn)
+                page = place.tracker.decode(pair, levels, pilots, place.turn, place.limit)
         except LostPageError as error:
             if isinstance(error, UnconfirmedPageError):
                 _inferred(unconfirmed_page(error), stages)

@@ -36,6 +36,7 @@ from lightpage.runtime.model.execution.page_graph import (
     open_graph,
 )
 from lightpage.runtime.model.execution.providers import ON_CPU, Provider
+from lightpage.runtime.model.execution.step_times import StepLimit
 from lightpage.words import brief
 
 if TYPE_CHECKING:
@@ -209,6 +210,7 @@ class Decoder:
         *,
         doubtful: bool = False,
         alone: bool = False,
+        limit: StepLimit | None = None,
     ) -> Inference:
         """Run the graph on a checked pair, together with other callers' where pages are computed in batches.
 
@@ -219,6 +221,7 @@ class Decoder:
                 them.
             doubtful: whether frames with a residual beyond the bundle's limit are taken too.
             alone: whether it is computed by itself, as exactly as the golden page says.
+            limit: limit on the time of an estimator's steps; pages of a batch get all of them.
 
         Raises:
             InvalidInputError: a table that does not fit.
@@ -236,7 +239,7 @@ class Decoder:
                 feeds |= pilot_tensors(pilots)
             names = [*self._outputs, *(_OF_ESTIMATE if self._estimates else ())]
             with self.batches.alone:
-                page = _page_of(self.graph, names, feeds, self.bundle, alone=alone)
+                page = _page_of(self.graph, names, feeds, self.bundle, limit, alone=alone)
         check_residual(page.residual, self.bundle.manifest, doubtful=doubtful)
         return self.view.seen(page, table.get(REGISTRATION))
 
@@ -294,13 +297,16 @@ class Decoder:
         written, shown = self.bundle.written_pilots(levels), self.bundle.levels(levels)
         return Pilots(self.bundle.pilot_mask, shown.phases[written])
 
-    def decode(self, pair: FramePair, levels: int = 256, pilots: Pilots | None = None) -> DecodedPage:
+    def decode(
+        self, pair: FramePair, levels: int = 256, pilots: Pilots | None = None, limit: StepLimit | None = None
+    ) -> DecodedPage:
         """Decode a frame pair into symbols of `levels` levels.
 
         Args:
             pair: both frames.
             levels: M, 2..256.
             pilots: the known symbols of this page, where they differ from this device's pattern.
+            limit: see `infer`.
 
         Raises:
             FrameError, PageError: see `check`, `check_levels` and `infer`.
@@ -310,12 +316,12 @@ class Decoder:
         with self.batches.under_way():
             self.check(pair)
             checked = time.perf_counter()
-            inference = self.infer(pair, pilots=pilots or self.pilots(levels))
+            inference = self.infer(pair, pilots=pilots or self.pilots(levels), limit=limit)
             inferred = time.perf_counter()
             page = self.post_process(inference, levels, pilots)
         waited, behind = inference.waited_s, time.perf_counter() - inferred
-        timings = Timings(checked - start, inferred - checked - waited, behind, waiting_s=waited, steps=inference.steps)
-        return replace(page, timings=timings)
+        timings = Timings(checked - start, inferred - checked - waited, behind, waiting_s=waited)
+        return replace(page, timings=timings.with_steps(inference))
 
     def post_process(self, inference: Inference, levels: int, pilots: Pilots | None = None) -> DecodedPage:
         """Piston, crosstalk, smooth phase error, flicker, trust, decision: all behind the graph; timings are zero."""
@@ -351,7 +357,13 @@ _OF_ESTIMATE = ("nuisance", RESIDUAL)
 
 
 def _page_of(
-    graph: PageGraph, names: list[str], feeds: dict[str, NDArray[Any]], bundle: Bundle, *, alone: bool
+    graph: PageGraph,
+    names: list[str],
+    feeds: dict[str, NDArray[Any]],
+    bundle: Bundle,
+    limit: StepLimit | None,
+    *,
+    alone: bool,
 ) -> Inference:
     """Run a graph on a page.
 
@@ -359,15 +371,17 @@ def _page_of(
     Such a page is estimated again with all steps of the bundle, and judged by them.
     """
     residual = bundle.manifest.residual_output
-    run = graph.run_whole if alone else graph.run
-    page = _inference(dict(zip(names, run(names, feeds), strict=True)), residual)
     if not isinstance(graph, EstimatorGraph):
-        return page
-    limit = bundle.manifest.residual_limit
-    if alone or limit is None or not page.residual > limit or graph.steps == graph.most_steps:
-        return replace(page, steps=graph.steps)
+        run = graph.run_whole if alone else graph.run
+        return _inference(dict(zip(names, run(names, feeds), strict=True)), residual)
+    most = graph.most_steps if alone else graph.steps
+    steps = most if limit is None else graph.times.steps_within(limit, most)
+    page = _inference(dict(zip(names, graph.run(names, feeds, steps), strict=True)), residual)
+    largest = bundle.manifest.residual_limit
+    if largest is None or not page.residual > largest or steps == graph.most_steps:
+        return replace(page, steps=steps, skipped_steps=most - steps)
     whole = _inference(dict(zip(names, graph.run_whole(names, feeds), strict=True)), residual)
-    return replace(whole, steps=graph.steps + graph.most_steps)
+    return replace(whole, steps=steps + graph.most_steps)
 
 
 def _inference(found: dict[str, NDArray[np.float32]], residual: str | None) -> Inference:

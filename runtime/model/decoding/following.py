@@ -13,6 +13,7 @@ from lightpage.runtime.model.decoding.page import DecodedPage
 from lightpage.runtime.model.decoding.tracking import NoTracker, Tracker
 from lightpage.runtime.model.execution.page_graph import check_steps
 from lightpage.runtime.model.execution.providers import ON_CPU, Provider
+from lightpage.runtime.model.execution.step_times import StepLimit
 
 
 class FollowingDecoder(Decoder):
@@ -50,19 +51,22 @@ class FollowingDecoder(Decoder):
         decoder = Decoder(self.bundle, self.threads, self.graph, steps=self.steps)
         return tracker_for(decoder) if self._tracking else NoTracker(decoder)
 
-    def decode(self, pair: FramePair, levels: int = 256, pilots: Pilots | None = None) -> DecodedPage:
+    def decode(
+        self, pair: FramePair, levels: int = 256, pilots: Pilots | None = None, limit: StepLimit | None = None
+    ) -> DecodedPage:
         """Decode a frame pair into symbols of `levels` levels.
 
         Args:
             pair: frames of the page.
             levels: M of the page.
             pilots: known symbols, where they are others than the bundle's.
+            limit: limit on the time of an estimator's steps.
 
         Raises:
             UnconfirmedPageError: the page's pilots contradict what was decoded.
             FrameError, PageError: see `Decoder.decode`.
         """
-        return self.tracker.decode(pair, levels, pilots)
+        return self.tracker.decode(pair, levels, pilots, limit=limit)
 
 
 def load(

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ from lightpage.runtime.model.decoding.page import DecodedPage, Inference, Timing
 from lightpage.runtime.model.decoding.tracking import NoTracker, Tracker, TrackerMemory, confirmed
 from lightpage.runtime.model.decoding.turns import Turn, Turns, patiently
 from lightpage.runtime.model.execution.estimator_graph import EstimatorGraph
+from lightpage.runtime.model.execution.step_times import StepLimit
 from lightpage.runtime.model.execution.twin import OnnxTwin
 
 Real = NDArray[np.float64]
@@ -138,6 +140,22 @@ class ImageState:
         return np.asarray(self.drift - np.concatenate([self.looked_px, self.traced_tilt]))
 
 
+class _Page(NamedTuple):
+    """A page as it is to be decoded.
+
+    Attributes:
+        pair: frames of the page.
+        levels: levels that it is shown at.
+        pilots: known symbols of the page.
+        limit: limit on the time of the steps of each inference.
+    """
+
+    pair: FramePair
+    levels: Levels
+    pilots: Pilots
+    limit: StepLimit | None
+
+
 @dataclass(frozen=True)
 class _Attempt:
     """A decode of a page.
@@ -240,7 +258,12 @@ class ImageTracker:
         return self._turns.take(waiting)
 
     def decode(
-        self, pair: FramePair, levels: int, pilots: Pilots | None = None, turn: Turn | None = None
+        self,
+        pair: FramePair,
+        levels: int,
+        pilots: Pilots | None = None,
+        turn: Turn | None = None,
+        limit: StepLimit | None = None,
     ) -> DecodedPage:
         """Decode a page where its image lies.
 
@@ -258,26 +281,24 @@ class ImageTracker:
                 clock.add("turn_s")
             with self._decoder.batches.under_way():
                 self._decoder.check(pair)
-                pilots = pilots or self._decoder.pilots(levels)
+                asked = _Page(pair, shown, pilots or self._decoder.pilots(levels), limit)
                 clock.add("check_s")
                 if self._in_batches:
-                    begun, inference = self._in_turn(turn, pair, pilots, clock)
-                best, found, step = self._followed(pair, begun, inference, shown, pilots, clock)
+                    begun, inference = self._in_turn(turn, asked, clock)
+                best, found, step = self._followed(asked, begun, inference, clock)
                 check_residual(best.inference.residual, self._decoder.bundle.manifest)
                 learn = partial(self._learn, begun, best, step, searched=found is not None)
                 if self._in_batches:  # the page behind waits for it
                     learn()
                     turn.close()
-                page = self._decoder.post_process(best.inference, levels, pilots)
+                page = self._decoder.post_process(best.inference, levels, asked.pilots)
                 if not self._in_batches:
                     learn()
                 clock.add("decision_s")
         page = replace(page, check=best.check, image=_position(best.after, found), timings=clock.timings)
         return confirmed(page, found)
 
-    def _in_turn(
-        self, turn: Turn, pair: FramePair, pilots: Pilots, clock: _Clock
-    ) -> tuple[ImageState, Inference | None]:
+    def _in_turn(self, turn: Turn, page: _Page, clock: _Clock) -> tuple[ImageState, Inference | None]:
         """The state that the page before has left, and what the graph says of a page by it; nothing before any page.
 
         The graph runs beforehand, and again where a page before it shows that the image is to be looked at elsewhere.
@@ -285,7 +306,7 @@ class ImageTracker:
         while True:
             state, inference = self.state, None
             if state.settled:
-                inference = _inferred(pair, state, pilots)
+                inference = _inferred(page, state)
                 clock.add_inference(inference)
             else:
                 state.decoder.batches.put_off()
@@ -303,38 +324,30 @@ class ImageTracker:
         return now.settled != state.settled or now.decoder is not state.decoder or bool(moved)
 
     def _followed(
-        self,
-        pair: FramePair,
-        begun: ImageState,
-        inference: Inference | None,
-        levels: Levels,
-        pilots: Pilots,
-        clock: _Clock,
+        self, page: _Page, begun: ImageState, inference: Inference | None, clock: _Clock
     ) -> tuple[_Attempt, FoundImage | None, Estimate | None]:
         """The attempt at a page that counts, the outcome of a search for its image, and what it tells of the walk."""
         state, found = begun, None
-        if not begun.settled and self._search is not None and len(pilots.phases) >= FEWEST_SEARCHED:
-            found = self._search.find(pair, pilots, self._around(begun))
+        if not begun.settled and self._search is not None and len(page.pilots.phases) >= FEWEST_SEARCHED:
+            found = self._search.find(page.pair, page.pilots, self._around(begun))
             state = self._moved_to(found, begun)
             clock.add("search_s")
-        best = self._attempts(pair, state, levels, pilots, found, clock, inference)
+        best = self._attempts(page, state, found, clock, inference)
         step = best.step if found is None else None
         if found is None and self._search is not None and _search_may_pay(best.check, begun):
-            found = self._search.find(pair, pilots, self._around(begun))
+            found = self._search.find(page.pair, page.pilots, self._around(begun))
             moved = self._moved_to(found, best.after)
             clock.add("search_s")
             if moved is not best.after:
-                there = self._attempts(pair, moved, levels, pilots, found, clock)
+                there = self._attempts(page, moved, found, clock)
                 if not _worse(there, best):
                     best, step = there, None
         return best, found, step
 
     def _attempts(
         self,
-        pair: FramePair,
+        page: _Page,
         state: ImageState,
-        levels: Levels,
-        pilots: Pilots,
         found: FoundImage | None,
         clock: _Clock,
         inference: Inference | None = None,
@@ -348,9 +361,9 @@ class ImageTracker:
         best: _Attempt | None = None
         for _ in range(1 + CORRECTIONS):
             if inference is None:
-                inference = _inferred(pair, state, pilots)
+                inference = _inferred(page, state)
                 clock.add_inference(inference)
-            attempt = self._read(inference, state, levels, pilots)
+            attempt = self._read(inference, state, page.levels, page.pilots)
             clock.add("decision_s")
             if best is not None and _worse(attempt, best):
                 break
@@ -484,10 +497,10 @@ def tracker_for(decoder: Decoder, memory: TrackerMemory | None = None) -> Tracke
     return ImageTracker(decoder, DriftModel.of_decoder(decoder, twin), BundleTables(decoder, twin), search, memory)
 
 
-def _inferred(pair: FramePair, state: ImageState, pilots: Pilots) -> Inference:
+def _inferred(page: _Page, state: ImageState) -> Inference:
     """Return what the graph says of a page. An estimator's residual is judged later, where the image is found."""
     doubtful = isinstance(state.decoder.graph, EstimatorGraph)
-    return state.decoder.infer(pair, state.table, pilots, doubtful=doubtful)
+    return state.decoder.infer(page.pair, state.table, page.pilots, doubtful=doubtful, limit=page.limit)
 
 
 def _search_may_pay(check: PilotCheck, begun: ImageState) -> bool:
@@ -528,7 +541,7 @@ class _Clock:
     def add_inference(self, inference: Inference) -> None:
         """Count the time since the last call as an inference, without what the page waited in it, and its steps."""
         self.add("inference_s", inference.waited_s)
-        self.timings = replace(self.timings, steps=self.timings.steps + inference.steps)
+        self.timings = self.timings.with_steps(inference)
 
     def add(self, part: str, waited_s: float = 0.0) -> None:
         """Count the time since the last call as one of `Timings`' parts, but what was waited of it."""

@@ -32,7 +32,8 @@ class Inference:
     the homodyne equations over the field's, or of an estimator the mean square of the counts' residuals over their
     variance, not finite for frames without the light of a page. `waited_s` are the seconds for which the page waited
     for others of its batch. An estimator also says by what `drift` the page's light lies off the table, [4] as in
-    `lightpage.runtime.model.decoding.image_drift`, and its number of Gauss-Newton `steps`.
+    `lightpage.runtime.model.decoding.image_drift`, and its number of Gauss-Newton `steps`; there was no time for
+    `skipped_steps` more.
     """
 
     p: NDArray[np.float32]
@@ -42,6 +43,7 @@ class Inference:
     waited_s: float = 0.0
     drift: NDArray[np.float64] | None = None
     steps: int = 0
+    skipped_steps: int = 0
 
     def turned(self, by: NDArray[np.floating]) -> Inference:
         """The same with `by` (radians [ny, nx]) added to the phases."""
@@ -62,6 +64,7 @@ class Timings:
         waiting_s: waiting for the other pages of a batch, and for the batch before it.
         turn_s: waiting for the pages before it, behind which it is followed.
         steps: number of Gauss-Newton steps of all inferences of the page; 0 for a network's bundle.
+        skipped_steps: number of steps that these inferences lack, since the caller's time was short.
     """
 
     check_s: float
@@ -71,6 +74,12 @@ class Timings:
     waiting_s: float = 0.0
     turn_s: float = 0.0
     steps: int = 0
+    skipped_steps: int = 0
+
+    def with_steps(self, inference: Inference) -> Timings:
+        """The same times with the steps of one more inference."""
+        skipped = self.skipped_steps + inference.skipped_steps
+        return replace(self, steps=self.steps + inference.steps, skipped_steps=skipped)
 
     @property
     def waited_s(self) -> float:

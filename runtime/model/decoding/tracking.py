@@ -14,6 +14,7 @@ from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.page import DecodedPage
 from lightpage.runtime.model.decoding.turns import Turn, Turns, patiently
+from lightpage.runtime.model.execution.step_times import StepLimit
 
 
 class TrackerMemory(BaseModel):
@@ -51,13 +52,19 @@ class Tracker(Protocol):
         """
 
     def decode(
-        self, pair: FramePair, levels: int, pilots: Pilots | None = None, turn: Turn | None = None
+        self,
+        pair: FramePair,
+        levels: int,
+        pilots: Pilots | None = None,
+        turn: Turn | None = None,
+        limit: StepLimit | None = None,
     ) -> DecodedPage:
         """Decode a page.
 
         Args:
             pair, levels, pilots: as for `Decoder.decode`.
             turn: turn of the page; by default it comes behind all that have begun. It is closed at the end.
+            limit: limit on the time of the steps of each inference.
 
         Raises:
             UnconfirmedPageError: the page's pilots do not bear out what the decoder claims of it.
@@ -100,10 +107,15 @@ class NoTracker:
         return Turns().take(waiting)
 
     def decode(
-        self, pair: FramePair, levels: int, pilots: Pilots | None = None, turn: Turn | None = None
+        self,
+        pair: FramePair,
+        levels: int,
+        pilots: Pilots | None = None,
+        turn: Turn | None = None,
+        limit: StepLimit | None = None,
     ) -> DecodedPage:
         """See `Tracker`."""
-        return confirmed(self._decoder.decode(pair, levels, pilots=pilots))
+        return confirmed(self._decoder.decode(pair, levels, pilots, limit))
 
     @property
     def image_px(self) -> tuple[float, float]:

@@ -14,6 +14,7 @@ from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.errors import BundleError, InvalidInputError
 from lightpage.runtime.model.execution.providers import ON_CPU, Provider
 from lightpage.runtime.model.execution.session import BoundSession, Port, Session, open_session, running
+from lightpage.runtime.model.execution.step_times import StepTimes
 from lightpage.runtime.model.execution.table_graph import GraphFile, HeldTable, check_table, with_outputs
 
 ESTIMATE = ("p", "nuisance", "deviations")
@@ -82,7 +83,7 @@ class _OpenedOnce:
 class EstimatorGraph:
     """The graphs of an estimator with their table.
 
-    It is immutable. Several threads may call its methods at the same time.
+    It is immutable, apart from the times that it measures. Several threads may call its methods at the same time.
 
     Args:
         files: serialised graphs.
@@ -100,6 +101,7 @@ class EstimatorGraph:
         provider: execution provider of the pages' graphs.
         most_steps: number of steps that the bundle has.
         steps: number of steps that a page gets.
+        times: times of the first estimate and of steps; graphs with another table share them.
 
     Raises:
         InvalidInputError: a tensor of `table` has an unknown name, a wrong type or shape, or values that are not
@@ -128,6 +130,7 @@ class EstimatorGraph:
         self.table: SamplingTable = table or {}
         check_table(self.ports, self.table)
         self._limit = steps
+        self.times: StepTimes = StepTimes(EARLY_STEPS) if like is None else like.times
         self.most_steps = most_steps(self.ports, subject)
         self.steps = self.most_steps if steps is None else min(steps, self.most_steps)
         if like is None:
@@ -217,10 +220,12 @@ class EstimatorGraph:
             steps: number of steps; `self.steps` if left out.
         """
         steps = self.steps if steps is None else steps
-        state = self.first_estimate(feeds)
+        with self.times.measured(0):
+            state = self.first_estimate(feeds)
         for number in range(1, steps + 1):
             wanted = (*ESTIMATE_OUTPUTS, CHI_SQUARE) if number == steps else ESTIMATE
-            state = self.step(state, feeds, number, wanted)
+            with self.times.measured(number):
+                state = self.step(state, feeds, number, wanted)
         return [state[name] for name in outputs]
 
     def step(

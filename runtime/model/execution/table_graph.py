@@ -20,6 +20,7 @@ from lightpage.errors import BundleError, InvalidInputError
 from lightpage.runtime.model.execution.pb.lightpage.onnx import graph_pb2 as pb
 from lightpage.runtime.model.execution.providers import ON_CPU, Provider
 from lightpage.runtime.model.execution.session import BoundSession, Port, Session, open_session, running
+from lightpage.runtime.model.execution.step_times import StepTimes
 
 _DTYPES = {1: "float32", 2: "uint8", 4: "uint16", 6: "int32", 7: "int64", 10: "float16", 11: "float64"}
 """numpy's names of ONNX's element types."""
@@ -251,6 +252,9 @@ class TableGraph:
         profile: see `open_session`.
         provider: what pages are computed with; what is computed once is computed on the CPU.
 
+    Attributes:
+        steps, times: those of an estimator's graph: none, and no times.
+
     Raises:
         InvalidInputError: a table that does not fit.
         BundleError: the graph cannot be run.
@@ -271,6 +275,8 @@ class TableGraph:
         self._file, self._subject, self._fed_names, self._threads = file, subject, fed, threads
         self.provider = provider
         """What computes pages."""
+        self.steps = 0
+        self.times = StepTimes(0)
         self.ports = file.table_inputs
         """Type and shape of every tensor of the table, by name."""
         self.table: SamplingTable = table or {}

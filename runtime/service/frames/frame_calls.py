@@ -147,7 +147,7 @@ class FrameCalls:
             what holds the pair, to be closed once that is decoded.
         """
         self.check(header)
-        self._plane.decodes.check(_caller(header, call))
+        self._plane.check_time(_caller(header, call))
         shape = header.rows_px, header.columns_px
         receiver = PairReceiver(shape, pixel_type(header.pixel_type), self._plane.received)
         try:
@@ -283,7 +283,8 @@ def _header(first: FramePart | None, call: Call) -> pb.DecodeHeader:
 def _caller(header: pb.DecodeHeader, call: Call) -> Caller:
     """The caller, whose pages without a session of their own are those of its connection, or of none."""
     session = call.session(header.options.session) or call.connection_session
-    return call.caller.in_session(session, not session or header.options.tracking == pb.TRACKING_STATELESS)
+    stateless = not session or header.options.tracking == pb.TRACKING_STATELESS
+    return call.caller.in_session(session, stateless, header.options.least_steps)
 
 
 def check_black(header: pb.DecodeHeader | pb.RecalibrateFramesHeader) -> None:

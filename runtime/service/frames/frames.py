@@ -203,7 +203,7 @@ def decode(
     """
     stages = stages or Stages()
     stages.begin(Stage.QUEUE)
-    with order or Turns().take() as order, plane.decodes.held(caller):
+    with order or Turns().take() as order, plane.slot(caller):
         began = time.perf_counter()
         # Taken once: a swap in the meantime changes the next request, not this one.
         model = plane.models.expect(version)
@@ -220,7 +220,7 @@ def decode(
                 page = plane.decode(model, place, pair, levels, pilots, subject, stages, monitor, sure=sure)
             found = plane.user_data(model, page, stages, monitor) if user_data else None
             seen.note(page=page, user_data=found)
-        plane.decodes.took(time.perf_counter() - began - page.timings.turn_s)
+        plane.took(model, time.perf_counter() - began, page.timings)
     return plane.answer(page, model, stages, found, monitor)
 
 
@@ -251,6 +251,7 @@ def decode_reply(
             decode_s=page.timings.worked_s,
             inference_s=page.timings.inference_s,
             steps=page.timings.steps,
+            skipped_steps=page.timings.skipped_steps,
         ),
         correlation_id=correlation_id,
         frame_id=frame_id,

@@ -46,6 +46,7 @@ PARAMETERS: dict[str, type] = {
     "levels": int,
     "black_level": int,
     "pilot_levels": int,
+    "least_steps": int,
     "session": str,
     "stateless": bool,
 }
@@ -174,7 +175,7 @@ class InferenceCalls:
         """Decode a pair."""
         stages = call.times.page()
         stages.begin(Stage.RECEIVE)
-        self._plane.decodes.check(call.caller)
+        self._plane.check_time(call.caller.in_session("", True, least_steps=1))  # its request is not read yet
         sent = _Sent(await receive(), self._plane.received, self._most_beside)
         call.correlation_id = sent.request.id
         call.caller.actor = call.actor
@@ -217,6 +218,7 @@ class InferenceCalls:
             pb.DecodeOptions,
             levels=asked.get("levels", 0),
             session=asked.get("session", ""),
+            least_steps=asked.get("least_steps", 0),
             tracking="STATELESS" if asked.get("stateless") else "SESSION",
             want_concentration="concentration" in names,
             want_phase="phase" in names,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -80,6 +80,7 @@ class ServiceMetrics:
         )
         self.rejects = counter("lightpage_rejects", "Calls and pages that ended with an error.", ["reason"])
         self.pages = counter("lightpage_pages", "Decoded and confirmed pages of the newest models.", ["model_version"])
+        self.steps = counter("lightpage_steps", "Gauss-Newton steps of pages, taken or skipped.", ["outcome"])
         self.decode = Histogram("lightpage_decode_seconds", "Decode of a page.", buckets=_SECONDS, registry=own)
         self.confidence = gauge("lightpage_confidence_mean", "Mean confidence of the last confirmed page.")
         self.concentration = gauge("lightpage_concentration_mean", "Mean von Mises kappa of the last confirmed page.")
@@ -108,6 +109,7 @@ class ServiceMetrics:
         """Show what may happen before it does: Prometheus sees no rise from nothing to the first one."""
         known: tuple[tuple[Counter, Iterable[str]], ...] = (
             (self.rejects, (name.removeprefix("ERROR_REASON_") for name in pb.ErrorReason.keys()[1:])),
+            (self.steps, ("taken", "skipped")),
             (self.lost_pages, (reason.value for reason in PageLoss)),
             (self.data_pages, (_READ, *(loss.value for loss in Loss))),
             (self.searches, ("true", "false")),
@@ -144,6 +146,8 @@ class ServiceMetrics:
             if version in self._versions:
                 self.pages.labels(version).inc()
         self.decode.observe(page.timings.worked_s)
+        self.steps.labels("taken").inc(page.timings.steps)
+        self.steps.labels("skipped").inc(page.timings.skipped_steps)
         if not shown:
             return
         self.confidence.set(float(page.confidence.mean()))
@@ -179,6 +183,10 @@ class ServiceMetrics:
     def watch_load(self, decodes: Slots, received: ReceiveBudget) -> None:
         """Show how busy the service is, whenever somebody looks."""
         self.registry.register(_Figures(partial(_load, decodes, received)))
+
+    def watch_steps(self, usual_s: Callable[[], Sequence[float]]) -> None:
+        """Show the usual time of a page's inference by its number of steps, whenever somebody looks."""
+        self.registry.register(_Figures(partial(_steps, usual_s)))
 
     def watch_batches(self, pages: UnderWay, largest: Callable[[], int]) -> None:
         """Show how full batches are, and what the device does that computes them, whenever somebody looks."""
@@ -229,6 +237,14 @@ def _load(decodes: Slots, received: ReceiveBudget) -> Iterator[Metric]:
     yield CounterMetricFamily("lightpage_received_bytes", "Frames that callers sent.", value=received.taken)
     yield GaugeMetricFamily("lightpage_receive_buffer_bytes", "Undecoded frames of callers.", value=received.used)
     yield GaugeMetricFamily("lightpage_receive_buffer_limit_bytes", "Limit of undecoded frames.", value=received.size)
+
+
+def _steps(usual_s: Callable[[], Sequence[float]]) -> Iterator[Metric]:
+    """Yield the usual time of a page's inference with 1, 2, ... steps."""
+    told = GaugeMetricFamily("lightpage_steps_seconds", "Usual inference with so many steps.", labels=["steps"])
+    for steps, seconds in enumerate(usual_s(), 1):
+        told.add_metric([str(steps)], seconds)
+    yield told
 
 
 def _batches(pages: UnderWay, largest: Callable[[], int]) -> Iterator[Metric]:

@@ -52,7 +52,9 @@ class PageCalls:
         def work() -> bytes:
             # The answer is wanted even where its caller leaves meanwhile, and asks again.
             until = self._clock.now() + limit_s
-            detached = Caller(lambda: until - self._clock.now(), caller.session, caller.stateless, caller.actor)
+            detached = Caller(
+                lambda: until - self._clock.now(), caller.session, caller.stateless, caller.actor, caller.least_steps
+            )
             return self._read(request, detached, stages).SerializeToString()
 
         same = pb.ReadPageRequest()
@@ -151,7 +153,8 @@ class PageCalls:
 
 def _caller(options: pb.DecodeOptions, call: Call) -> Caller:
     """The caller with its session; without one, the pages are those of the device."""
-    return call.caller.in_session(call.session(options.session), options.tracking == pb.TRACKING_STATELESS)
+    stateless = options.tracking == pb.TRACKING_STATELESS
+    return call.caller.in_session(call.session(options.session), stateless, options.least_steps)
 
 
 def data_reply(page: DataPage) -> pb.ReadDataReply:

@@ -124,7 +124,7 @@ def read_page(
     source, stages, monitor = plane.source, stages or Stages(), plane.monitors.device
     stages.begin(Stage.QUEUE)
     # The slot first: pages that wait for one shall not be read yet, nor lie in memory.
-    with order or Turns().take() as order, plane.decodes.held(caller):
+    with order or Turns().take() as order, plane.slot(caller):
         model, begun = plane.models.current, time.perf_counter()
         seen = Seen(f"{'next page' if page is None else f'page {page}'} of {source.name}", page, model.version)
         with observed(plane.monitors.told_by(monitor), seen):
@@ -151,7 +151,7 @@ def read_page(
                     decoded = plane.decode(model, place, found.pair, levels, pilots, subject, stages, monitor)
             data = plane.user_data(model, decoded, stages, monitor, expected) if user_data else None
             seen.note(page=decoded, user_data=data)
-        plane.decodes.took(time.perf_counter() - begun - decoded.timings.turn_s)
+        plane.took(model, time.perf_counter() - begun, decoded.timings)
     return ReadAnswer(plane.answer(decoded, model, stages, data, monitor), found, mask, model)
 
 

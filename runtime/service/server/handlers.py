@@ -67,4 +67,5 @@ class Describing:
             code_toml=bundle.manifest.code,
             user_bytes_per_page=0 if bundle.code is None else model.decoder.page_codec.user_bytes,
             pilot_phases=bundle.pilot_phases,
+            steps_s=plane.steps_s(),
         )

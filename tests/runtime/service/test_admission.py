@@ -144,6 +144,19 @@ def test_slow_calls_are_forgotten_and_a_few_turn_nobody_away() -> None:
         slots.check(waits(0.12))
 
 
+def test_steps_that_may_be_left_out_are_not_waited_for() -> None:
+    slots = Slots(1, "decodes", 60.0)
+    slots.took(1.0, skipped_s=2.0)
+    assert (slots.usual_s, slots.needed_s) == (1.0, pytest.approx(3.3))
+    with pytest.raises(OverloadedError, match=r"at least 3\.30 s"):
+        slots.check(waits(2.0))
+    with pytest.raises(OverloadedError, match=r"at least 2\.30 s"):
+        slots.take(waits(2.0), optional_s=1.0)
+    assert slots.busy == 0
+    with slots.held(waits(2.0), optional_s=2.0):
+        assert slots.expected_wait_s() == 1.0
+
+
 def test_a_slot_that_is_taken_at_once_is_waited_for_by_nobody() -> None:
     slots = Slots(2, "uploads", 60.0)
     with slots.held_at_once(), slots.held_at_once():

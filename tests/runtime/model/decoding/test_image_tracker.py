@@ -19,6 +19,7 @@ from lightpage.runtime.model.decoding.image_drift import SHIFT, TILT, DriftModel
 from lightpage.runtime.model.decoding.image_tracker import CORRECTIONS, RETRACE_RAD, WALK, ImageState, ImageTracker
 from lightpage.runtime.model.decoding.page import Inference
 from lightpage.runtime.model.decoding.tracking import TrackerMemory
+from lightpage.runtime.model.execution.step_times import StepLimit
 from tests.runtime import toy
 from tests.runtime.model.decoding.test_image_drift import SLOPES
 from tests.waiting import eventually
@@ -76,6 +77,7 @@ class FakeDecoder:
         pilots: Pilots | None = None,
         *,
         doubtful: bool = False,
+        limit: StepLimit | None = None,
     ) -> Inference:
         device = self._device
         shift = (table or {}).get("shift", np.zeros(2))
@@ -316,6 +318,7 @@ def test_attempts_are_bounded_where_the_image_flees_and_a_fork_learns_on_its_own
         pilots: Pilots | None = None,
         *,
         doubtful: bool = False,
+        limit: StepLimit | None = None,
     ) -> Inference:
         device.drift[SHIFT] += 1.0
         return infer(self, pair, table)
@@ -456,6 +459,7 @@ class NoiseDecoder(FakeDecoder):
         pilots: Pilots | None = None,
         *,
         doubtful: bool = False,
+        limit: StepLimit | None = None,
     ) -> Inference:
         sure = replace(self._decoder.infer(pair), concentration=np.full(toy.PAGE, 300.0, np.float32))
         return sure.turned(self.rng.uniform(-np.pi, np.pi, toy.PAGE))
@@ -503,6 +507,7 @@ class PhaseDecoder(FakeDecoder):
         pilots: Pilots | None = None,
         *,
         doubtful: bool = False,
+        limit: StepLimit | None = None,
     ) -> Inference:
         device = self._device
         shift = (table or {}).get("shift", np.zeros(2))

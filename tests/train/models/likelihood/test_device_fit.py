@@ -28,12 +28,13 @@ TWIN = TorchTwin(RayTwin(PROFILE))
 DIM = Sensor(full_well_e=100)
 BLUR = 0.09
 """Variance of the simulated modulator's blur."""
+SHIFT_ERROR_PX = 0.15
 ERRORS = {
     "pipe_angle_rad": 2e-4,
     "launch_defocus_rad": 0.15,
     "camera_curvature_rad": -0.15,
     "in_phase_scale_x_relative": 4e-4,
-    "quadrature_shift_y_px": 0.15,
+    "quadrature_shift_y_px": SHIFT_ERROR_PX,
     "quadrature_axial_rad": 0.1,
 }
 """Errors of a registration, several times the deviations of a fit."""
@@ -137,5 +138,7 @@ def test_a_step_that_makes_the_counts_less_likely_is_not_taken(known: Known) -> 
     likelihood = Backwards(TorchLikelihood(PhaseEstimator(PROFILE, start.parameters).eval()), start.parameters)
     fit = DeviceFit(likelihood, TWIN, PROFILE, known.device.references, known.pages)
     found, _ = fit.refined(start, LaunchConditions(np.eye(6)[0] + 0j, BLUR))
-    np.testing.assert_array_equal(found.parameters, start.parameters)
+    of_pages = np.array(["camera_tilt" in name or "_shift_" in name for name in NAMES])  # their mean tilt and shift
+    np.testing.assert_array_equal(found.parameters[~of_pages], start.parameters[~of_pages])
+    np.testing.assert_allclose(found.parameters[of_pages], start.parameters[of_pages], atol=SHIFT_ERROR_PX / 2)
     assert found.quadrature_phase == start.quadrature_phase

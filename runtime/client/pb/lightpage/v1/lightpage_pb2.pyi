@@ -210,7 +210,7 @@ class DescribeRequest(_message.Message):
     def __init__(self) -> None: ...
 
 class DescribeReply(_message.Message):
-    __slots__ = ("service_version", "model", "camera", "page", "limits", "source", "source_levels", "profile_toml", "calibration_toml", "pilot_mask", "pilot_phases", "code_toml", "user_bytes_per_page", "default_levels")
+    __slots__ = ("service_version", "model", "camera", "page", "limits", "source", "source_levels", "profile_toml", "calibration_toml", "pilot_mask", "pilot_phases", "code_toml", "user_bytes_per_page", "default_levels", "steps_s")
     SERVICE_VERSION_FIELD_NUMBER: _ClassVar[int]
     MODEL_FIELD_NUMBER: _ClassVar[int]
     CAMERA_FIELD_NUMBER: _ClassVar[int]
@@ -225,6 +225,7 @@ class DescribeReply(_message.Message):
     CODE_TOML_FIELD_NUMBER: _ClassVar[int]
     USER_BYTES_PER_PAGE_FIELD_NUMBER: _ClassVar[int]
     DEFAULT_LEVELS_FIELD_NUMBER: _ClassVar[int]
+    STEPS_S_FIELD_NUMBER: _ClassVar[int]
     service_version: str
     model: Model
     camera: Camera
@@ -239,7 +240,8 @@ class DescribeReply(_message.Message):
     code_toml: str
     user_bytes_per_page: int
     default_levels: int
-    def __init__(self, service_version: _Optional[str] = ..., model: _Optional[_Union[Model, _Mapping]] = ..., camera: _Optional[_Union[Camera, _Mapping]] = ..., page: _Optional[_Union[PageShape, _Mapping]] = ..., limits: _Optional[_Union[Limits, _Mapping]] = ..., source: _Optional[str] = ..., source_levels: _Optional[int] = ..., profile_toml: _Optional[str] = ..., calibration_toml: _Optional[str] = ..., pilot_mask: _Optional[bytes] = ..., pilot_phases: _Optional[_Iterable[float]] = ..., code_toml: _Optional[str] = ..., user_bytes_per_page: _Optional[int] = ..., default_levels: _Optional[int] = ...) -> None: ...
+    steps_s: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, service_version: _Optional[str] = ..., model: _Optional[_Union[Model, _Mapping]] = ..., camera: _Optional[_Union[Camera, _Mapping]] = ..., page: _Optional[_Union[PageShape, _Mapping]] = ..., limits: _Optional[_Union[Limits, _Mapping]] = ..., source: _Optional[str] = ..., source_levels: _Optional[int] = ..., profile_toml: _Optional[str] = ..., calibration_toml: _Optional[str] = ..., pilot_mask: _Optional[bytes] = ..., pilot_phases: _Optional[_Iterable[float]] = ..., code_toml: _Optional[str] = ..., user_bytes_per_page: _Optional[int] = ..., default_levels: _Optional[int] = ..., steps_s: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Model(_message.Message):
     __slots__ = ("name", "version", "created", "current", "metrics", "pinned", "loaded", "origin")
@@ -313,7 +315,7 @@ class Limits(_message.Message):
     def __init__(self, message_bytes: _Optional[int] = ..., chunk_bytes: _Optional[int] = ..., pair_bytes: _Optional[int] = ..., concurrent_decodes: _Optional[int] = ..., replay_s: _Optional[float] = ..., replay_bytes: _Optional[int] = ..., recalibration_pages: _Optional[int] = ..., model_bytes: _Optional[int] = ..., range_pages: _Optional[int] = ..., shared_bytes: _Optional[int] = ...) -> None: ...
 
 class DecodeOptions(_message.Message):
-    __slots__ = ("levels", "confidence_format", "want_concentration", "want_phase", "want_user_data", "session", "tracking")
+    __slots__ = ("levels", "confidence_format", "want_concentration", "want_phase", "want_user_data", "session", "tracking", "least_steps")
     LEVELS_FIELD_NUMBER: _ClassVar[int]
     CONFIDENCE_FORMAT_FIELD_NUMBER: _ClassVar[int]
     WANT_CONCENTRATION_FIELD_NUMBER: _ClassVar[int]
@@ -321,6 +323,7 @@ class DecodeOptions(_message.Message):
     WANT_USER_DATA_FIELD_NUMBER: _ClassVar[int]
     SESSION_FIELD_NUMBER: _ClassVar[int]
     TRACKING_FIELD_NUMBER: _ClassVar[int]
+    LEAST_STEPS_FIELD_NUMBER: _ClassVar[int]
     levels: int
     confidence_format: ConfidenceFormat
     want_concentration: bool
@@ -328,7 +331,8 @@ class DecodeOptions(_message.Message):
     want_user_data: bool
     session: str
     tracking: Tracking
-    def __init__(self, levels: _Optional[int] = ..., confidence_format: _Optional[_Union[ConfidenceFormat, str]] = ..., want_concentration: bool = ..., want_phase: bool = ..., want_user_data: bool = ..., session: _Optional[str] = ..., tracking: _Optional[_Union[Tracking, str]] = ...) -> None: ...
+    least_steps: int
+    def __init__(self, levels: _Optional[int] = ..., confidence_format: _Optional[_Union[ConfidenceFormat, str]] = ..., want_concentration: bool = ..., want_phase: bool = ..., want_user_data: bool = ..., session: _Optional[str] = ..., tracking: _Optional[_Union[Tracking, str]] = ..., least_steps: _Optional[int] = ...) -> None: ...
 
 class Pilots(_message.Message):
     __slots__ = ("mask", "values", "levels")
@@ -533,18 +537,20 @@ class ImagePosition(_message.Message):
     def __init__(self, shift_x_px: _Optional[float] = ..., shift_y_px: _Optional[float] = ..., tilt_x_rad: _Optional[float] = ..., tilt_y_rad: _Optional[float] = ..., searched: bool = ..., found: bool = ...) -> None: ...
 
 class Timings(_message.Message):
-    __slots__ = ("receive_s", "decode_s", "inference_s", "total_s", "steps")
+    __slots__ = ("receive_s", "decode_s", "inference_s", "total_s", "steps", "skipped_steps")
     RECEIVE_S_FIELD_NUMBER: _ClassVar[int]
     DECODE_S_FIELD_NUMBER: _ClassVar[int]
     INFERENCE_S_FIELD_NUMBER: _ClassVar[int]
     TOTAL_S_FIELD_NUMBER: _ClassVar[int]
     STEPS_FIELD_NUMBER: _ClassVar[int]
+    SKIPPED_STEPS_FIELD_NUMBER: _ClassVar[int]
     receive_s: float
     decode_s: float
     inference_s: float
     total_s: float
     steps: int
-    def __init__(self, receive_s: _Optional[float] = ..., decode_s: _Optional[float] = ..., inference_s: _Optional[float] = ..., total_s: _Optional[float] = ..., steps: _Optional[int] = ...) -> None: ...
+    skipped_steps: int
+    def __init__(self, receive_s: _Optional[float] = ..., decode_s: _Optional[float] = ..., inference_s: _Optional[float] = ..., total_s: _Optional[float] = ..., steps: _Optional[int] = ..., skipped_steps: _Optional[int] = ...) -> None: ...
 
 class ReadPageRequest(_message.Message):
     __slots__ = ("page", "options", "want_written", "request_id", "correlation_id")
