@@ -17,6 +17,11 @@ Progress = Callable[[str, float], None]
 State = Callable[[], str]
 
 
+def part(progress: Progress, begin: float, end: float) -> Progress:
+    """Return the progress of a part of the work, which lies between the shares `begin` and `end` of the whole."""
+    return lambda what, share: progress(what, begin + share * (end - begin))
+
+
 class Reporter(Protocol):
     """Shows how far a loop has come."""
 

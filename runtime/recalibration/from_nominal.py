@@ -10,12 +10,12 @@ import numpy as np
 from lightpage.calibration.calibrate import KnownPage, Registered, calibrate
 from lightpage.calibration.document import BlemishCounts, Calibration
 from lightpage.calibration.known_pages import known_pages, without_blemishes
-from lightpage.calibration.likelihood.device_fit import DeviceFit
+from lightpage.calibration.likelihood.device_fit import AFTER_REGISTRATION, DeviceFit
 from lightpage.calibration.likelihood.table import FLAT_FIELD, PIXEL_GAINS
 from lightpage.calibration.sampling_table import apart_inputs
 from lightpage.device.profile import Profile
 from lightpage.errors import CalibrationError
-from lightpage.progress import Progress
+from lightpage.progress import Progress, part
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import narrow
 from lightpage.recording.pixels.blemishes import Blemishes
@@ -65,9 +65,10 @@ def calibrate_by_graphs(
     blemishes, known, _ = recorded_pages(recording, profile, pages)
     twin = OnnxTwin(decoder.bundle)
     device = twin, decoder.field_solver, profile, blemishes.references, known
-    registered = calibrate(*device, progress, any_orientation=any_orientation)
+    registered = calibrate(*device, part(progress, 0, AFTER_REGISTRATION), any_orientation=any_orientation)
     _check_planes(decoder, registered)
     assert registered.conditions is not None  # its waves were fitted
+    refining = part(progress, AFTER_REGISTRATION, 1)
     likelihood = GraphLikelihood(neutral_graph(decoder, blemishes))
     fit = DeviceFit(
         likelihood,
@@ -75,7 +76,7 @@ def calibrate_by_graphs(
         profile,
         blemishes.references,
         known,
-        lambda share: progress("likelihood of all known pages", share),
+        lambda share: refining("likelihood of all known pages", share),
     )
     refined, statistics = fit.refined(registered, registered.conditions)
     _check_planes(decoder, refined)

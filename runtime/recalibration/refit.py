@@ -9,13 +9,13 @@ from lightpage.calibration.calibrate import LEAST_KEPT, KnownPage, refine
 from lightpage.calibration.document import BlemishCounts, Calibration
 from lightpage.calibration.image_search import REACH_PX
 from lightpage.calibration.interfaces import FieldSolver, Twin
-from lightpage.calibration.likelihood.device_fit import DeviceFit
+from lightpage.calibration.likelihood.device_fit import AFTER_REGISTRATION, DeviceFit
 from lightpage.calibration.likelihood.table import PIXEL_GAINS, launch_tensors
 from lightpage.calibration.sampling_table import apart_inputs, moved_cameras, sampling_table
 from lightpage.errors import BundleError, CalibrationError
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import symbol_phases
-from lightpage.progress import Progress, warn
+from lightpage.progress import Progress, part, warn
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import hash_frames
 from lightpage.recording.pixels.blemishes import UNIT_GAIN, Blemishes
@@ -31,6 +31,8 @@ from lightpage.runtime.recalibration.recalibration import RefitReport, RefitResu
 
 REFITTED = frozenset({"places", "parameters"})
 """Inputs that a re-fitted geometry is fed to, by one of which a decoder knows it."""
+_BEFORE_NOISE = 0.9
+"""Share of a re-fit's time after which the noise of an estimator is measured."""
 _SEARCHED_SYMBOLS = 300
 """Known symbols by which the image is looked for: enough in any light that can be calibrated in, and soon done."""
 
@@ -67,6 +69,7 @@ def refit(
         expected = f"{among}: this decoder holds its geometry itself; calibrate, train and export anew"
         raise BundleError(f"{bundle.subject}: table inputs", sorted(decoder.graph.ports), expected)
     graph = decoder.graph
+    registration_share = AFTER_REGISTRATION if isinstance(graph, EstimatorGraph) else 1.0
     blemishes = blemishes_of(decoder, pages.references)
     references = blemishes.references
     twin = OnnxTwin(bundle) if twin is None else twin
@@ -88,7 +91,7 @@ def refit(
             known,
             start=start,
             quadrature_phase=earlier.turn_rad,
-            progress=progress,
+            progress=part(progress, 0, registration_share),
             modulation=earlier.modulator,
             near=pages.near,
             judged=not isinstance(graph, EstimatorGraph),
@@ -120,7 +123,7 @@ def refit(
         profile,
         references,
         known,
-        lambda share: progress("likelihood of all known pages", share),
+        lambda share: part(progress, AFTER_REGISTRATION, _BEFORE_NOISE)("likelihood of all known pages", share),
     )
     refined, statistics = fit.refined(registered, conditions)
     counts = BlemishCounts.of(blemishes)
@@ -134,7 +137,7 @@ def refit(
         known,
         statistics,
         mask,
-        lambda share: progress("noise of the estimator", share),
+        lambda share: part(progress, _BEFORE_NOISE, 1)("noise of the estimator", share),
     )
     result = traced(decoder, twin, references, fitted, image, blemishes.gains)
     return replace(result, table={**result.table, **measured})

@@ -91,10 +91,14 @@ def test_pages_of_a_batch_are_read_as_each_alone_where_each_image_lies(
         assert deviation(expected.p, found.p) < (0.15 if shift.any() else 0.03)
         assert found.residual == pytest.approx(expected.residual, rel=0.08)
         known = Pilots.of_symbols(mask, symbols, 256)
-        pages = [decoder.post_process(each, 256, known) for each in (expected, found)]
         rates = [
-            measure(page.phase[~mask], page.concentration[~mask], symbols[~mask], 256).air_bits_per_symbol
-            for page in pages
+            measure(
+                decoder.post_process(each, 256, known).phase[~mask],
+                each.concentration[~mask],  # as claimed, whatever the few pilots of a small page confirm
+                symbols[~mask],
+                256,
+            ).air_bits_per_symbol
+            for each in (expected, found)
         ]
         assert rates[1] > rates[0] - 0.005
 

@@ -9,9 +9,9 @@ import torch
 from lightpage.calibration import calibrate as registration
 from lightpage.calibration.document import BlemishCounts, Calibration
 from lightpage.calibration.known_pages import known_pages, without_blemishes
-from lightpage.calibration.likelihood.device_fit import DeviceFit
+from lightpage.calibration.likelihood.device_fit import AFTER_REGISTRATION, DeviceFit
 from lightpage.device.profile import Profile
-from lightpage.progress import Progress
+from lightpage.progress import Progress, part
 from lightpage.recording.pixels.blemishes import Blemishes
 from lightpage.recording.reader import Recording
 from lightpage.train.data.features import CPU
@@ -52,10 +52,12 @@ def calibrate_recording(
     known = without_blemishes(known_pages(recording, profile, pages), blemishes)
     solver = TorchFieldSolver(FieldRecovery(profile).to(compute))
     device = twin, solver, profile, blemishes.references, known
+    registering = part(progress, 0, AFTER_REGISTRATION)
+    refining = part(progress, AFTER_REGISTRATION, 1)
     if near is None:
-        registered = registration.calibrate(*device, progress, any_orientation=any_orientation)
+        registered = registration.calibrate(*device, registering, any_orientation=any_orientation)
     else:
-        registered = registration.refine(*device, near.vector, near.turn_rad, progress, near.modulator, judged=False)
+        registered = registration.refine(*device, near.vector, near.turn_rad, registering, near.modulator, judged=False)
     hashes = [recording.page_hash(page) for page in pages]
     counts = BlemishCounts.of(blemishes)
     if registered.conditions is None:
@@ -66,7 +68,7 @@ def calibrate_recording(
         profile,
         blemishes.references,
         known,
-        lambda share: progress("likelihood of all known pages", share),
+        lambda share: refining("likelihood of all known pages", share),
     )
     refined, statistics = fit.refined(registered, registered.conditions)
     return Calibration.from_registered(refined, profile, hashes, statistics, counts)

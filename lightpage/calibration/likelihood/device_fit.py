@@ -68,6 +68,10 @@ _ILLUMINATION_STEP = 0.02
 """Finite difference of an illumination's term, over the even one."""
 
 
+AFTER_REGISTRATION = 0.7
+"""Share of a calibration's time after which the likelihood of all pages is fitted: 35 of 50 s on the bench device."""
+
+
 class _Solution(NamedTuple):
     """Scoring step.
 
