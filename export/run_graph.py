@@ -12,7 +12,7 @@ from lightpage.export.estimator_graphs import WholeGraph
 from lightpage.export.graph import DecoderGraph, Graph, PublishedGraph, published_tensors, table_tensors
 from lightpage.export.parity import torch_answer
 from lightpage.recording.frame_pair import FramePair
-from lightpage.runtime.model.bundle.bundle import in_few_counts, in_few_roots, residual_limit, shows_page
+from lightpage.runtime.model.bundle.bundle import COARSE, residual_limit, shows_page
 from lightpage.train.models.twin import RayTwin, TorchTwin
 from lightpage.train.published.trainer import published_decoder
 from lightpage.train.published.training import PublishedChoices
@@ -51,7 +51,7 @@ def golden_of(
     """
     answer = torch_answer(graph, pair, defaults)
     limit = _residual_limit(graph, pair, defaults, answer, residual)
-    for rounded in (in_few_counts, in_few_roots):
+    for rounded in COARSE:
         coarse = rounded(pair, bit_depth)
         to_coarse = torch_answer(graph, coarse, defaults)
         if limit is None or shows_page(float(to_coarse[residual]), limit):

@@ -18,7 +18,7 @@ from lightpage.errors import CalibrationError, FrameError, RecalibrationRefusedE
 from lightpage.progress import Progress
 from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import hash_frames
-from lightpage.runtime.model.bundle.bundle import Bundle, in_few_counts, in_few_roots, npz, shows_page, write_bundle
+from lightpage.runtime.model.bundle.bundle import COARSE, Bundle, npz, shows_page, write_bundle
 from lightpage.runtime.model.bundle.manifest import GOLDEN, TABLE, Manifest, Provenance, check_version
 from lightpage.runtime.model.decoding.batch_graph import with_proven_batches
 from lightpage.runtime.model.decoding.decoder import Decoder
@@ -183,7 +183,7 @@ def golden_page(decoder: Decoder, pair: FramePair) -> tuple[FramePair, NDArray[n
     manifest = decoder.bundle.manifest
     answer = decoder.infer(pair, alone=True)
     limit = manifest.residual_limit
-    for rounded in (in_few_counts, in_few_roots):
+    for rounded in COARSE:
         coarse = rounded(pair, manifest.camera_bit_depth)
         try:
             to_coarse = decoder.infer(coarse, alone=True)

@@ -316,6 +316,16 @@ def test_few_roots_err_by_a_share_of_the_shot_noise(bit_depth: int) -> None:
     assert np.abs(errors).max() < 1.2 * np.sqrt(1 << bit_depth) / 16
 
 
+def test_few_roots_of_two_rows_are_those_of_their_means() -> None:
+    counts = np.random.default_rng(0).integers(0, 256, (5, 7)).astype(np.uint8)
+    few = in_few_roots(FramePair(counts, counts), 8, rows=2).in_phase
+    means = np.round(counts[:4].reshape(2, 2, 7).mean(1)).astype(np.uint8)
+    expected = in_few_roots(FramePair(means, means), 8).in_phase
+    np.testing.assert_array_equal(few[0:4:2], few[1:4:2])
+    assert np.mean(few[0:4:2] == expected) > 0.9  # means lie between whole counts
+    np.testing.assert_array_equal(few[4], in_few_roots(FramePair(counts[4:], counts[4:]), 8).in_phase[0])
+
+
 @pytest.mark.parametrize(("coarse", "shows"), [(0.0014, True), (0.0019, False), (float("nan"), False)])
 def test_a_golden_page_must_stay_clear_of_the_limit(coarse: float, shows: bool) -> None:
     assert shows_page(coarse, 0.003) is shows
