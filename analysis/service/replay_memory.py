@@ -30,10 +30,9 @@ from lightpage.runtime.device.acquisition.source import SHOT_S, FrameSource, Sho
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.model.decoding.page import DecodedPage
+from lightpage.runtime.model.decoding.page import DecodedPage, StepLimit
 from lightpage.runtime.model.decoding.tracking import NoTracker
 from lightpage.runtime.model.decoding.turns import Turn
-from lightpage.runtime.model.execution.step_times import StepLimit
 from lightpage.runtime.service.caller import Call, Caller
 from lightpage.runtime.service.dataplane import DataPlane
 from lightpage.runtime.service.models.loader import Loader

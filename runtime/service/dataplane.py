@@ -28,10 +28,9 @@ from lightpage.page.pilots import Pilots
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.device.acquisition.source import FrameSource
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.model.decoding.page import DecodedPage, Timings
+from lightpage.runtime.model.decoding.page import DecodedPage, StepLimit, Timings
 from lightpage.runtime.model.decoding.tracking import Tracker, unconfirmed_page
 from lightpage.runtime.model.decoding.turns import Turn
-from lightpage.runtime.model.execution.step_times import StepLimit
 from lightpage.runtime.service.admission import Heart, ReceiveBudget, Slots
 from lightpage.runtime.service.caller import Caller
 from lightpage.runtime.service.limits import Limits

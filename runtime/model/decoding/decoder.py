@@ -25,7 +25,7 @@ from lightpage.runtime.model.decoding.batches import NO_BATCHES, Batches, Batchi
 from lightpage.runtime.model.decoding.camera_view import CameraView
 from lightpage.runtime.model.decoding.field_solver import BundleFieldSolver
 from lightpage.runtime.model.decoding.golden import check_golden
-from lightpage.runtime.model.decoding.page import OUTPUTS, DecodedPage, Inference, Timings, check_residual
+from lightpage.runtime.model.decoding.page import OUTPUTS, DecodedPage, Inference, StepLimit, Timings, check_residual
 from lightpage.runtime.model.execution.estimator_graph import RESIDUAL, EstimatorGraph
 from lightpage.runtime.model.execution.page_graph import (
     PAGE_INPUTS,
@@ -36,7 +36,6 @@ from lightpage.runtime.model.execution.page_graph import (
     open_graph,
 )
 from lightpage.runtime.model.execution.providers import ON_CPU, Provider
-from lightpage.runtime.model.execution.step_times import StepLimit
 from lightpage.words import brief
 
 if TYPE_CHECKING:
@@ -375,7 +374,7 @@ def _page_of(
         run = graph.run_whole if alone else graph.run
         return _inference(dict(zip(names, run(names, feeds), strict=True)), residual)
     most = graph.most_steps if alone else graph.steps
-    steps = most if limit is None else graph.times.steps_within(limit, most)
+    steps = most if limit is None else graph.times.steps_within(limit.seconds_left(), limit.least, most)
     page = _inference(dict(zip(names, graph.run(names, feeds, steps), strict=True)), residual)
     largest = bundle.manifest.residual_limit
     if largest is None or not page.residual > largest or steps == graph.most_steps:

@@ -9,11 +9,10 @@ from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.shipped import bundle_path
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
-from lightpage.runtime.model.decoding.page import DecodedPage
+from lightpage.runtime.model.decoding.page import DecodedPage, StepLimit
 from lightpage.runtime.model.decoding.tracking import NoTracker, Tracker
 from lightpage.runtime.model.execution.page_graph import check_steps
 from lightpage.runtime.model.execution.providers import ON_CPU, Provider
-from lightpage.runtime.model.execution.step_times import StepLimit
 
 
 class FollowingDecoder(Decoder):

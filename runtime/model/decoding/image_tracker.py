@@ -21,11 +21,10 @@ from lightpage.runtime.model.bundle.manifest import FIELD
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_drift import SHIFT, TILT, BundleSearch, BundleTables, DriftModel, Estimate
 from lightpage.runtime.model.decoding.image_position import ImagePosition
-from lightpage.runtime.model.decoding.page import DecodedPage, Inference, Timings, check_residual
+from lightpage.runtime.model.decoding.page import DecodedPage, Inference, StepLimit, Timings, check_residual
 from lightpage.runtime.model.decoding.tracking import NoTracker, Tracker, TrackerMemory, confirmed
 from lightpage.runtime.model.decoding.turns import Turn, Turns, patiently
 from lightpage.runtime.model.execution.estimator_graph import EstimatorGraph
-from lightpage.runtime.model.execution.step_times import StepLimit
 from lightpage.runtime.model.execution.twin import OnnxTwin
 
 Real = NDArray[np.float64]

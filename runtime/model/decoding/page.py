@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +22,18 @@ OUTPUTS = ("p", "phase", "concentration")
 _SYMBOLS = 4096
 """Symbols at most by which a page's information is estimated: their mean is exact to a few thousandths, and soon taken.
 """
+
+
+class StepLimit(NamedTuple):
+    """Limit on the time of a page's Gauss-Newton steps.
+
+    Attributes:
+        least: fewest steps that the page may have, 1 or more.
+        seconds_left: returns the time left for the first estimate and the steps, seconds.
+    """
+
+    least: int
+    seconds_left: Callable[[], float]
 
 
 @dataclass(frozen=True)

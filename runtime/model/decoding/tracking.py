@@ -12,9 +12,8 @@ from lightpage.errors import Reason, UnconfirmedPageError
 from lightpage.page.pilots import LEAST_CONFIRMED_SHARE, Pilots
 from lightpage.recording.frame_pair import FramePair
 from lightpage.runtime.model.decoding.decoder import Decoder
-from lightpage.runtime.model.decoding.page import DecodedPage
+from lightpage.runtime.model.decoding.page import DecodedPage, StepLimit
 from lightpage.runtime.model.decoding.turns import Turn, Turns, patiently
-from lightpage.runtime.model.execution.step_times import StepLimit
 
 
 class TrackerMemory(BaseModel):

@@ -7,24 +7,11 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from statistics import median
-from typing import NamedTuple
 
 _REMEMBERED = 9
 """Measurements of each kind that count."""
 _MARGIN = 1.1
 """Time that steps are expected to take at most, over their usual time."""
-
-
-class StepLimit(NamedTuple):
-    """Limit on the time of a page's Gauss-Newton steps.
-
-    Attributes:
-        least: fewest steps that the page may have, 1 or more.
-        seconds_left: returns the time left for the first estimate and the steps, seconds.
-    """
-
-    least: int
-    seconds_left: Callable[[], float]
 
 
 class StepTimes:
@@ -57,11 +44,10 @@ class StepTimes:
         """Usual time of a later step, seconds; 0 where none was measured yet."""
         return float(median([*self._lately[2]] or [0.0]))
 
-    def steps_within(self, limit: StepLimit, most: int) -> int:
-        """Number of steps for which there is time: from `limit.least` to `most`, and `most` where that is less."""
-        left_s = limit.seconds_left()
+    def steps_within(self, left_s: float, least: int, most: int) -> int:
+        """Number of steps for which `left_s` seconds are enough, from `least` to `most`; `most` where that is less."""
         steps = most
-        while steps > limit.least and _MARGIN * self.seconds(steps) > left_s:
+        while steps > least and _MARGIN * self.seconds(steps) > left_s:
             steps -= 1
         return steps
 

@@ -148,9 +148,9 @@ def test_steps_that_may_be_left_out_are_not_waited_for() -> None:
     slots = Slots(1, "decodes", 60.0)
     slots.took(1.0, skipped_s=2.0)
     assert (slots.usual_s, slots.needed_s) == (1.0, pytest.approx(3.3))
-    with pytest.raises(OverloadedError, match=r"at least 3\.30 s"):
+    with pytest.raises(OverloadedError, match=r"3\.30"):
         slots.check(waits(2.0))
-    with pytest.raises(OverloadedError, match=r"at least 2\.30 s"):
+    with pytest.raises(OverloadedError, match=r"2\.30"):
         slots.take(waits(2.0), optional_s=1.0)
     assert slots.busy == 0
     with slots.held(waits(2.0), optional_s=2.0):

@@ -57,7 +57,7 @@ def test_a_caller_who_takes_fewer_steps_is_answered_in_time(slow: Running) -> No
 
 @pytest.mark.parametrize("options", [{}, {"least_steps": 2}])
 def test_a_caller_who_wants_more_steps_is_refused_at_once(slow: Running, options: dict[str, int]) -> None:
-    with pytest.raises(OverloadedError, match="s until the deadline"):
+    with pytest.raises(OverloadedError, match="deadline"):
         decoded(slow, **options)
 
 

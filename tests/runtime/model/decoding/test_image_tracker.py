@@ -17,9 +17,8 @@ from lightpage.runtime.model.decoding.batches import OneByOne
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_drift import SHIFT, TILT, DriftModel, Estimate
 from lightpage.runtime.model.decoding.image_tracker import CORRECTIONS, RETRACE_RAD, WALK, ImageState, ImageTracker
-from lightpage.runtime.model.decoding.page import Inference
+from lightpage.runtime.model.decoding.page import Inference, StepLimit
 from lightpage.runtime.model.decoding.tracking import TrackerMemory
-from lightpage.runtime.model.execution.step_times import StepLimit
 from tests.runtime import toy
 from tests.runtime.model.decoding.test_image_drift import SLOPES
 from tests.waiting import eventually

@@ -5,7 +5,7 @@ from itertools import count
 
 import pytest
 
-from lightpage.runtime.model.execution.step_times import StepLimit, StepTimes
+from lightpage.runtime.model.execution.step_times import StepTimes
 
 
 def measured(durations: dict[int, list[float]]) -> StepTimes:
@@ -44,12 +44,12 @@ def test_old_times_are_forgotten() -> None:
     ],
 )
 def test_a_page_gets_the_steps_for_which_there_is_time(left_s: float, least: int, most: int, steps: int) -> None:
-    assert TIMES.steps_within(StepLimit(least, lambda: left_s), most) == steps
+    assert TIMES.steps_within(left_s, least, most) == steps
 
 
 def test_before_anything_was_measured_all_steps_are_taken() -> None:
     clock = count()
-    assert StepTimes(1, lambda: next(clock)).steps_within(StepLimit(1, lambda: 0.1), 3) == 3
+    assert StepTimes(1, lambda: next(clock)).steps_within(0.1, 1, 3) == 3
 
 
 def test_a_step_that_fails_is_not_measured() -> None:
