@@ -102,12 +102,14 @@ class Likelihood(NamedTuple):
         by_nuisance: derivatives by the nuisance parameters, [6].
         expected: counts that the light would give perfect cameras, [2, Gy, Gx].
         by_sample: derivative by the phase of each of the modulator's samples, [ny S, nx S].
+        by_amplitude: derivative by a relative change of each symbol's amplitude, [ny, nx].
     """
 
     by_phase: Tensor
     by_nuisance: Tensor
     expected: Tensor
     by_sample: Tensor
+    by_amplitude: Tensor
 
 
 class _Prediction(NamedTuple):
@@ -237,7 +239,8 @@ class PhaseEstimator(nn.Module):
         by_turn = symbol[0] * back[1] - symbol[1] * back[0]
         by_sample = by_turn + to_samples(slope, self.samples) * by_log
         by_nuisance = self.nuisances.gradient(light.leaving, at_exit, light.field, score, THINNED if thinned else 1)
-        return Likelihood(summed(by_sample, self.samples), by_nuisance, expected, by_sample)
+        by_phase, by_amplitude = summed(by_sample, self.samples), summed(by_log, self.samples)
+        return Likelihood(by_phase, by_nuisance, expected, by_sample, by_amplitude)
 
     def expected_counts(
         self,
@@ -288,6 +291,10 @@ class PhaseEstimator(nn.Module):
     ) -> tuple[Estimate, Tensor]:
         """Move an estimate by the Gauss-Newton step of all phases and nuisance parameters together.
 
+        While the others are at their expected light, the likelihood of a symbol's phasor x is that of a complex normal
+        density about a point z, and that of its phase a von Mises density of mean arg(z), whose concentration grows
+        with |z|. So the derivatives by phase and amplitude both count.
+
         The Hessian of the phases is approximated as local (`LocalHessian`). Their coupling with the nuisance parameters
         is kept: `responses` are the changes of all phases that compensate a unit change of a nuisance parameter best.
 
@@ -317,8 +324,11 @@ class PhaseEstimator(nn.Module):
         step, deviations = hessian.solve(likelihood.by_sample, None if coarse else estimate.deviations)
         step = step - (responses * change[:, None, None]).sum(0)
         step = torch.clamp(step, -LARGEST_STEP_RAD, LARGEST_STEP_RAD)
-        concentration = _concentration(information, noise)
-        turned = multiply(direction, (torch.cos(step), torch.sin(step)))
+        by_amplitude = likelihood.by_amplitude * (1 + slope * slope) / information
+        along = (torch.sqrt(expected_phasors(estimate.p).square().sum(0)) + by_amplitude) / (1 + change[0])
+        length = torch.sqrt(along * along + step * step + 1e-20)
+        concentration = _concentration(length * information, noise)
+        turned = multiply(direction, (along / length, step / length))
         direction, piston = without_piston(turned, concentration, table)
         gain = multiply(scaled(parts(estimate.nuisance[:2]), 1 + change[0]), piston)
         nuisance = torch.cat([torch.stack(gain), estimate.nuisance[2:] + change[1:]])

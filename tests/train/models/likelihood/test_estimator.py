@@ -15,7 +15,7 @@ from lightpage.calibration.likelihood.table import FLAT_FIELD, count_tensors, pi
 from lightpage.calibration.sampling_table import APART, SamplingTable
 from lightpage.calibration.waves.wave_fit import WaveFit
 from lightpage.calibration.waves.wave_model import LaunchConditions
-from lightpage.device.state import CameraPose, Device, Drift, SlmDefects
+from lightpage.device.state import CameraPose, Device, Drift, Sensor, SlmDefects
 from lightpage.page.correction import wrapped
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import random_symbols, symbol_phases
@@ -26,6 +26,7 @@ from lightpage.simulator.true_optics import perfectly_calibrated
 from lightpage.train.models.likelihood.estimator import Estimate, Likelihood, Operators, Page, PhaseEstimator
 from lightpage.train.models.likelihood.modulator import summed, to_samples
 from lightpage.train.models.likelihood.torch_likelihood import TorchLikelihood
+from lightpage.train.models.prediction import expected_phasors
 from lightpage.train.models.twin import RayTwin, TorchTwin
 from lightpage.train.models.waves import THINNED, Fidelity
 from tests.lightpage.small import random_phases, small_profile
@@ -66,16 +67,21 @@ class Posed:
 
     VARIANCE = 4.0
 
-    def at(self, phases: np.ndarray, nuisance: np.ndarray, *, coarse: bool = False) -> Likelihood:
-        p = torch.from_numpy(SURE * np.stack([np.cos(phases), np.sin(phases)])).float()
+    def at(
+        self, phases: np.ndarray, nuisance: np.ndarray, *, coarse: bool = False, kappa: float | np.ndarray = SURE
+    ) -> Likelihood:
+        p = torch.from_numpy(kappa * np.stack([np.cos(phases), np.sin(phases)])).float()
         still = torch.zeros_like(self.operators.illumination[0])
         estimate = Estimate(p, torch.from_numpy(nuisance).float(), still)
         cameras = self.estimator.recovery.cameras(*(self.table[name] for name in APART if name in self.table))
         return self.estimator.likelihood(self.operators, self.table, self.page, estimate, cameras, coarse=coarse)
 
-    def logarithm(self, phases: np.ndarray, nuisance: np.ndarray, *, coarse: bool = False) -> float:
+    def logarithm(
+        self, phases: np.ndarray, nuisance: np.ndarray, *, coarse: bool = False, kappa: float | np.ndarray = SURE
+    ) -> float:
         page = self.page.thinned if coarse else self.page
-        missed = (page.counts - self.at(phases, nuisance, coarse=coarse).expected).double() * page.lit
+        expected = self.at(phases, nuisance, coarse=coarse, kappa=kappa).expected
+        missed = (page.counts - expected).double() * page.lit
         return -float(missed.square().sum()) / (2 * self.VARIANCE) * (THINNED**2 if coarse else 1)
 
     def slope(
@@ -116,6 +122,16 @@ def test_the_derivative_by_phases_is_that_of_the_likelihood(posed: Posed) -> Non
         direction = 0.01 * rng.standard_normal(PHASES.shape)
         slope = posed.slope(PHASES, NUISANCE, direction, np.zeros(6))
         assert slope == pytest.approx(np.sum(direction * by_phase), abs=1e-4 * float(np.linalg.norm(by_phase)))
+
+
+def test_the_derivative_by_amplitudes_is_that_of_the_likelihood(posed: Posed) -> None:
+    kappa = 5 + 0.1 * np.random.default_rng(0).standard_normal(PHASES.shape)
+    lengths = [float(expected_phasors(torch.tensor([each, 0.0]))[0]) for each in (4.9, 5.1)]
+    by_amplitude = posed.at(PHASES, NUISANCE, kappa=5.0).by_amplitude.numpy().astype(float)
+    there, back = (posed.logarithm(PHASES, NUISANCE, kappa=each) for each in (kappa, 10 - kappa))
+    expected = (lengths[1] - lengths[0]) / 0.2 * np.sum((kappa - 5) * by_amplitude)
+    largest = 0.1 * (lengths[1] - lengths[0]) / 0.2 * float(np.linalg.norm(by_amplitude))
+    assert (there - back) / 2 == pytest.approx(expected, abs=0.01 * largest)
 
 
 def test_the_derivative_by_nuisance_parameters_is_that_of_the_likelihood(posed: Posed) -> None:
@@ -187,11 +203,11 @@ def decoded(estimate: Estimate) -> np.ndarray:
     return np.asarray(np.arctan2(estimate.p[1].numpy(), estimate.p[0].numpy()))
 
 
-@pytest.fixture(scope="module")
-def fitted() -> Fitted:
-    simulator, symbols = Simulator(PROFILE, STILL, seed=1), written(1)
+def fitted_to(state: Device) -> Fitted:
+    """The estimator of a device, with the statistics of one page of it."""
+    simulator, symbols = Simulator(PROFILE, state, seed=1), written(1)
     pair, references = simulator.page(symbols), simulator.references()
-    device = perfectly_calibrated(PROFILE, STILL, references)
+    device = perfectly_calibrated(PROFILE, state, references)
     known = KnownPage(pair, np.exp(1j * symbol_phases(symbols, 256)))
     waves = WaveFit(TWIN, PROFILE, pair, references, known.symbols)
     conditions = waves.fit(device.parameters, device.quadrature_phase_rad, ("in_phase",)).conditions
@@ -201,6 +217,11 @@ def fitted() -> Fitted:
         conditions
     )
     return Fitted(estimator, estimator_table(likelihood, TWIN, device, [known], statistics))
+
+
+@pytest.fixture(scope="module")
+def fitted() -> Fitted:
+    return fitted_to(STILL)
 
 
 @pytest.fixture(scope="module")
@@ -223,6 +244,17 @@ def test_every_step_comes_nearer_to_the_page(fitted: Fitted, pages: tuple[np.nda
     assert 0.7 < np.mean(errors[-1] ** 2 * information) < 1.5  # as the information promises
     assert chi_squares[-1] == pytest.approx(1, abs=0.1)
     assert chi_squares[0] > 2
+
+
+def test_in_dim_light_concentrations_tell_which_symbols_are_right() -> None:
+    dim = STILL.model_copy(update={"sensor": Sensor(full_well_e=32, exposure_relative=0.03)})
+    phases = symbol_phases(written(2), 256)
+    estimates, _ = fitted_to(dim).read(Simulator(PROFILE, dim, seed=2).page(written(2)), phases)
+    agreement = np.cos(decoded(estimates[-1]) - phases)[~MASK]
+    concentrations = np.hypot(*estimates[-1].p.numpy())[~MASK]
+    sure = concentrations > np.median(concentrations)
+    assert 0.2 < agreement.mean() < 0.9  # neither lost nor all right
+    assert agreement[sure].mean() > agreement[~sure].mean() + 0.1
 
 
 def test_a_shift_of_the_image_is_found(fitted: Fitted, pages: tuple[np.ndarray, FramePair, FramePair]) -> None:
