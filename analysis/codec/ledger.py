@@ -19,7 +19,7 @@ import click
 import numpy as np
 from scipy.stats import binom
 
-from analysis.comparison.data_set import data_set_of, simulate
+from analysis.comparison.data_set import bundle_by_waves, data_set_of, simulate
 from analysis.comparison.kept_bundle import export_kept
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFolder
@@ -46,6 +46,8 @@ LOSS = 1e-6
 """Probability that a data page is lost behind the outer code."""
 VOLUME = 7
 _SEED = 90_000
+_KNOWN = 20
+"""Pages that a first user's code is chosen on."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,11 @@ def _kept(folder: str, method: str = COHERENT, refinements: int = 1) -> Callable
     return made
 
 
+def _by_waves(profile: Profile, device: Device, known: int, near: Path | None = None) -> Callable[[Path], Path]:
+    """Make a bundle by two known pages, whose code is chosen on so many others; see `bundle_by_waves`."""
+    return lambda work: bundle_by_waves(work / "device", profile, device, known, _SEED, near=near)[1]
+
+
 def data_sets(pages: int) -> dict[str, DataSet]:
     """Every data set by name; `pages` are those of the bench device."""
 
@@ -86,9 +93,16 @@ def data_sets(pages: int) -> dict[str, DataSet]:
         profile, device, _ = data_set_of(WEIGHTS / folder)
         return DataSet(name, _kept(folder, *method), profile, device, known, pages)
 
+    def by_waves(name: str, folder: str, pages: int) -> DataSet:
+        profile, device, _ = data_set_of(WEIGHTS / folder)
+        near = WEIGHTS / folder / "calibration.toml" if profile.name == "paper" else None
+        return DataSet(name, _by_waves(profile, device, _KNOWN, near), profile, device, 0, pages)
+
     sets = [
         DataSet("bright", lambda _: bundle_path("bench"), load_profile("bench"), Device(), 120, pages),
+        by_waves("32e waves", "bench/-0.6deg-32e-4px", pages),
         kept("32e", "bench/-0.6deg-32e-4px", 120, pages),
+        by_waves("full-size 4x4 waves", "paper/-0.6deg-32e-4px", 4),
         kept("full-size 4x4", "paper/-0.6deg-32e-4px", 8, 4),
         kept("full-size 4x4 standard", "paper/-0.6deg-32e-4px", 8, 4, WAVE, 0),
         kept("full-size 4x4 fast", "paper/-0.6deg-32e-4px", 8, 4, FAST, 0),

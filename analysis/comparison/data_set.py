@@ -14,6 +14,7 @@ from lightpage.cli.progress_bar import percent_bar
 from lightpage.device.profile import Profile, parse_profile
 from lightpage.device.state import Device, Sensor
 from lightpage.errors import InvalidInputError
+from lightpage.export.from_calibration import export_calibration
 from lightpage.recording.layout import hash_frames
 from lightpage.recording.reader import Recording
 from lightpage.run_files import BEGUN
@@ -21,6 +22,7 @@ from lightpage.simulator.recording_job import RecordingJob
 from lightpage.train.models.field import FieldRecovery, TorchFieldSolver
 from lightpage.train.models.twin import RayTwin, TorchTwin
 from lightpage.train.runs import begin
+from lightpage.train.trainers.calibration import calibrate_recording
 
 LEVELS = 256
 CALIBRATED = 2
@@ -70,6 +72,43 @@ def simulate(
         job = RecordingJob(profile, device, levels, seed, truth, out)
         job.claim(force=False)
         job.run(pages)
+
+
+def bundle_by_waves(
+    folder: Path,
+    profile: Profile,
+    device: Device,
+    pages: int,
+    seed: int,
+    levels: int = LEVELS,
+    near: Path | None = None,
+) -> tuple[Path, Path]:
+    """Make a bundle of a calibration by two pages; what is there already stays.
+
+    Args:
+        folder: folder of recording, calibration and bundle.
+        profile: nominal device.
+        device: true device.
+        pages: pages of the recording after those of the calibration; a code is chosen by them.
+        seed: seed of pages and noise.
+        levels: levels of the pages.
+        near: calibration of the device from which the fit starts; nominal if left out.
+
+    Returns:
+        Paths of the recording and of the bundle.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    recording = folder / "recording.h5"
+    calibration = folder / "calibration.toml"
+    bundle = folder / "bundle.zip"
+    simulate(recording, profile, device, CALIBRATED + pages, seed, levels)
+    with Recording.open(recording) as file, percent_bar() as progress:
+        if not calibration.exists():
+            start = None if near is None else load_calibration(near)
+            calibrate_recording(file, profile, range(CALIBRATED), progress, near=start).save(calibration)
+        if not bundle.exists():
+            export_calibration(load_calibration(calibration), file, profile, bundle, progress=progress)
+    return recording, bundle
 
 
 @contextmanager

@@ -55,7 +55,9 @@ PICTURED = "sheared"
 TEMPLATE = "results.md.j2"
 LEDGER_LABELS = {
     "bright": "bench, 4x4, 15,000 electrons, shipped",
+    "32e waves": "bench, 4x4, 32 electrons, fitted waves",
     "32e": "bench, 4x4, 32 electrons, two passes",
+    "full-size 4x4 waves": "full size, 4x4, 32 electrons, fitted waves",
     "full-size 4x4 fast": "full size, 4x4, 32 electrons, `fast`",
     "full-size 4x4 standard": "full size, 4x4, 32 electrons, `standard`",
     "full-size 4x4": "full size, 4x4, 32 electrons, two passes",

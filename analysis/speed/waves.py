@@ -22,14 +22,11 @@ from pathlib import Path
 import click
 import numpy as np
 
-from analysis.comparison.data_set import CALIBRATED, simulate
-from lightpage.calibration.document import load_calibration
+from analysis.comparison.data_set import CALIBRATED, bundle_by_waves
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile, OutputFolder
-from lightpage.cli.progress_bar import percent_bar
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device, draw_device, load_device
-from lightpage.export.from_calibration import export_calibration
 from lightpage.metrics.provenance import write_figures
 from lightpage.progress import track
 from lightpage.recording.frame_pair import FramePair
@@ -41,7 +38,6 @@ from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.model.execution.estimator_graph import NOISE
 from lightpage.train.runs import begin
-from lightpage.train.trainers.calibration import calibrate_recording
 
 _TIMED = 7
 """Timed inferences of each decoder."""
@@ -132,17 +128,8 @@ def main(
     asked |= {"--levels": levels, "--seed": seed, "--near": near and str(near)}
     out.mkdir(parents=True, exist_ok=True)
     begin(out, asked)
-    recording = out / "recording.h5"
-    calibration = out / "calibration.toml"
-    bundle = out / "bundle.zip"
-    simulate(recording, profile, device, CALIBRATED + pages, seed, levels)
+    recording, bundle = bundle_by_waves(out, profile, device, pages, seed, levels, near)
     limit = None if bound is None else _bits(bound)
-    with Recording.open(recording) as file, percent_bar() as progress:
-        if not calibration.exists():
-            start = None if near is None else load_calibration(near)
-            calibrate_recording(file, profile, range(CALIBRATED), progress, near=start).save(calibration)
-        if not bundle.exists():
-            export_calibration(load_calibration(calibration), file, profile, bundle, progress=progress)
     most = len(Decoder.load(bundle).graph.value(NOISE)) - 1
     decoders = [Decoder.load(bundle, steps=steps) for steps in range(1, most + 1)]
     rows = []
