@@ -367,7 +367,8 @@ def _page_of(
     """Run a graph on a page.
 
     Chi-square belongs to the estimate before the last step. With few steps it may exceed the limit for right frames.
-    Such a page is estimated again with all steps of the bundle, and judged by them.
+    Such a page is estimated again with all steps of the bundle, and judged by them; where there is no time for that, it
+    is left to its pilots.
     """
     residual = bundle.manifest.residual_output
     if not isinstance(graph, EstimatorGraph):
@@ -377,8 +378,11 @@ def _page_of(
     steps = most if limit is None else graph.times.steps_within(limit.seconds_left(), limit.least, most)
     page = _inference(dict(zip(names, graph.run(names, feeds, steps), strict=True)), residual)
     largest = bundle.manifest.residual_limit
+    page = replace(page, steps=steps, skipped_steps=most - steps)
     if largest is None or not page.residual > largest or steps == graph.most_steps:
-        return replace(page, steps=steps, skipped_steps=most - steps)
+        return page
+    if page.skipped_steps:
+        return replace(page, residual=largest)
     whole = _inference(dict(zip(names, graph.run_whole(names, feeds), strict=True)), residual)
     return replace(whole, steps=steps + graph.most_steps)
 
