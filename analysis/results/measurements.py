@@ -34,7 +34,7 @@ EVALUATION, DEMO, IMAGE_SEARCH, LEDGER, TOLERANCES = "evaluation", "demo", "imag
 PAGE_CODE = "page-code"
 SPEED = "speed-"
 """Before the name of a profile."""
-BOUND = "bound-"
+BOUND, WAVES = "bound-", "waves-"
 """Before the name of a data set."""
 
 
@@ -117,7 +117,8 @@ def slim(name: str, figures: Figures) -> Figures:
     Raises:
         InvalidInputError: another benchmark's.
     """
-    take = comparison if name in COMPARISONS else bound if name.startswith(BOUND) else _TAKE.get(name, speed)
+    prefix = next((each for each in (BOUND, WAVES) if name.startswith(each)), name)
+    take = comparison if name in COMPARISONS else _TAKE.get(prefix, speed)
     try:
         return take(figures)
     except (KeyError, TypeError, IndexError) as error:
@@ -186,15 +187,31 @@ def speed(figures: Figures) -> Figures:
     return {key: figures[key] for key in ("profile", "threads", "repeats", "decoders")}
 
 
-def bound(figures: Figures) -> Figures:
-    """Keep the figures of `analysis.comparison.bound`, with what tells its data set."""
-    profile, sensor = parse_profile(figures["asked"]["profile"], "bound"), figures["asked"]["device"]["sensor"]
+def _light(profile_toml: str, device: Figures) -> Figures:
+    """Return what tells the light of a simulated device."""
+    profile, sensor = parse_profile(profile_toml, "figures"), device["sensor"]
     return {
         "profile": profile.name,
-        "angle_deg": figures["asked"]["device"]["geometry"]["pipe_angle_deg"],
+        "angle_deg": device["geometry"]["pipe_angle_deg"],
         "full_well_e": sensor["full_well_e"],
         "exposure": sensor["exposure_relative"],
         "symbol_size_px": profile.page.symbol_size_px,
+    }
+
+
+def waves(figures: Figures) -> Figures:
+    """Keep the figures of `analysis.speed.waves` by the number of steps, but for its times: others work beside it."""
+    asked = figures["asked"]
+    kept = ("steps", "air", "ece", "over_claim")
+    rows = [{key: row[key] for key in kept} for row in figures["rows"]]
+    return {**_light(asked["--profile"], asked["device"]), "pages": asked["--pages"], "rows": rows}
+
+
+def bound(figures: Figures) -> Figures:
+    """Keep the figures of `analysis.comparison.bound`, with what tells its data set."""
+    asked = figures["asked"]
+    return {
+        **_light(asked["profile"], asked["device"]),
         "bits": figures["bits"],
         "standard_error": figures["standard_error"],
         "symbols": sum(map(len, figures["concentrations"])),
@@ -202,6 +219,8 @@ def bound(figures: Figures) -> Figures:
 
 
 _TAKE: dict[str, Callable[[Figures], Figures]] = {
+    BOUND: bound,
+    WAVES: waves,
     EVALUATION: evaluation,
     DEMO: demo,
     IMAGE_SEARCH: image_search,

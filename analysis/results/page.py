@@ -29,6 +29,7 @@ from analysis.results.measurements import (
     LEDGER,
     SPEED,
     TOLERANCES,
+    WAVES,
     Figures,
     Measurement,
     collected,
@@ -124,6 +125,13 @@ class Results:
         """Return the bounds of the light that are known."""
         return [of.figures for name, of in self.measurements.items() if name.startswith(BOUND)]
 
+    def waves(self) -> list[tuple[Figures, Figures]]:
+        """Return the figures of the fitted waves by light, the brightest first, each with the bound of its light."""
+        known = [of.figures for name, of in self.measurements.items() if name.startswith(WAVES)]
+        bounds = [self.bound_of(each["profile"], *(each[key] for key in _DATA_SET)) for each in known]
+        found = [(each, light) for each, light in zip(known, bounds, strict=True) if light is not None]
+        return sorted(found, key=lambda pair: -pair[1]["bits"])
+
     def bound(self, name: str, outcome: Figures) -> Figures | None:
         """Return the bound of a comparison's light, None where it is not known or the device has no defects."""
         profile = "paper" if name.startswith(FULL_SIZE) else "bench"
@@ -145,7 +153,8 @@ class Results:
         for name, measurement in self.measurements.items():
             of = measurement.provenance
             source = "notebook" if "notebook" in of.source else "output" if of.source else "complete"
-            found[of.commit[:7], source].append("bounds" if name.startswith(BOUND) else name)
+            kind = {BOUND: "bounds", WAVES: "waves"}.get(name.partition("-")[0] + "-", name)
+            found[of.commit[:7], source].append(kind)
         return [(origin, list(dict.fromkeys(names))) for origin, names in found.items()]
 
     def _miss(self, what: str) -> None:
@@ -192,10 +201,10 @@ def symbols(profile: str, size_px: int) -> str:
     return f"{columns} x {rows} of {size_px}x{size_px}"
 
 
-def bound_name(figures: Figures) -> str:
-    """Return the name under which a bound is kept."""
+def name_of_light(prefix: str, figures: Figures) -> str:
+    """Return the name under which the figures of a light are kept, a bound or those of the fitted waves."""
     angle, well, exposure, size = (f"{figures[key]:g}" for key in _DATA_SET)
-    return f"{BOUND}{figures['profile']}_{angle}deg_{well}e_{exposure}x_{size}px"
+    return f"{prefix}{figures['profile']}_{angle}deg_{well}e_{exposure}x_{size}px"
 
 
 def with_table(page: str, figures: Figures) -> str:
@@ -217,6 +226,12 @@ def with_table(page: str, figures: Figures) -> str:
     type=click.Path(path_type=Path),
     multiple=True,
     help="Collect a JSON of `analysis.comparison.bound`.",
+)
+@click.option(
+    "--waves",
+    type=click.Path(path_type=Path),
+    multiple=True,
+    help="Collect a JSON of `analysis.speed.waves`.",
 )
 @click.option("--evaluation", type=click.Path(path_type=Path), help="Collect the JSON of `lightpage evaluate`.")
 @click.option("--demo", type=click.Path(path_type=Path), help="Collect the demo.json of `lightpage demo`.")
@@ -241,6 +256,7 @@ def with_table(page: str, figures: Figures) -> str:
 def main(
     comparisons: Path | None,
     bounds: tuple[Path, ...],
+    waves: tuple[Path, ...],
     evaluation: Path | None,
     demo: Path | None,
     image_search: Path | None,
@@ -253,7 +269,8 @@ def main(
     """Write docs/results/index.md, its picture, and the table of tolerances.md from the kept figures."""
     given = {EVALUATION: evaluation, DEMO: demo, IMAGE_SEARCH: image_search, LEDGER: ledger, TOLERANCES: tolerances}
     found = {name: path for name, path in given.items() if path is not None}
-    found |= {bound_name(slim(BOUND, read_object(path))): path for path in bounds}
+    for prefix, paths in ((BOUND, bounds), (WAVES, waves)):
+        found |= {name_of_light(prefix, slim(prefix, read_object(path))): path for path in paths}
     found |= {f"{SPEED}{read_object(path).get('profile')}": path for path in speeds}
     if comparisons is not None:
         below = {name: comparisons / name / "figures.json" for name in COMPARISONS}
