@@ -7,6 +7,8 @@ from click.testing import CliRunner, Result
 from analysis.results.measurements import Measurement, kept_measurements
 from analysis.results.page import PAGE, ROOT, Results, main, render, with_table
 from lightpage.codec.code import Code
+from lightpage.device.profile import load_profile
+from lightpage.device.state import Device
 from lightpage.metrics.provenance import PROVENANCE, Provenance
 from lightpage.run_files import BEGUN
 from lightpage.runtime.model.bundle.bundle import Bundle
@@ -117,3 +119,23 @@ def test_figures_are_collected_without_their_curves_and_what_lacks_is_left_out(t
     written(path, {PROVENANCE: ORIGIN, **toy(outcome("ray", 3.0))})
     command(tmp_path, "--from", tmp_path / "runs")
     assert kept_measurements(tmp_path / "kept")["sheared"].figures == figures
+
+
+def test_figures_of_the_waves_stand_beside_the_bound_of_their_light(tmp_path: Path) -> None:
+    bench = load_profile("bench")
+    device = Device().with_settings(["sensor.full_well_e=32"]).model_dump(mode="json")
+    light = {PROVENANCE: ORIGIN, "asked": {"profile": bench.to_toml(), "device": device}}
+    bound = {**light, "bits": 5.0, "standard_error": 0.01, "concentrations": [[1.0]]}
+    rows = [
+        {"steps": steps, "air": air, "ece": 0.004, "over_claim": 0.0, "over_bound": None, "seconds": 1, "over_other": 1}
+        for steps, air in ((1, 4.1), (2, 4.9))
+    ]
+    asked = {"--profile": bench.to_toml(), "device": device, "--pages": 24}
+    waves = {PROVENANCE: ORIGIN, "asked": asked, "bound": None, "rows": rows}
+    paths = [written(tmp_path / name, of) for name, of in (("bound.json", bound), ("waves.json", waves))]
+    done = command(tmp_path, "--bound", paths[0], "--waves", paths[1])
+    assert done.exit_code == 0
+    page = (tmp_path / "results" / "index.md").read_text()
+    assert "| bench, 4x4, 32 electrons | 24 | 4.10, 4.90 | 4.900 (2) | 0.980 | 0.0040 |" in page
+    kept = kept_measurements(tmp_path / "kept")["waves-bench_-0.6deg_32e_1x_4px"].figures
+    assert "seconds" not in kept["rows"][0]
