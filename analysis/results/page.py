@@ -11,7 +11,7 @@ from __future__ import annotations
 import sys
 from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import click
@@ -284,6 +284,8 @@ def main(
         if lacking:  # a comparison writes its figures method by method
             click.echo(f"not collected, unfinished: {path} lacks {', '.join(sorted(lacking))}")
             continue
+        if name == LEDGER and name in before:  # data sets that were not measured anew stay
+            measurement = replace(measurement, figures={**before[name].figures, **measurement.figures})
         measurement.write(kept / f"{name}.json")
         click.echo(f"{name}: {measurement.provenance.time}, commit {measurement.provenance.commit[:7]}")
     results = Results(kept_measurements(kept))
