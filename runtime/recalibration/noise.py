@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from lightpage.calibration.calibrate import KnownPage
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.likelihood.flat_field import flat_field
+from lightpage.calibration.likelihood.known_page_fit import SHIFT
 from lightpage.calibration.likelihood.noise import expected_bits, fitted_noise
 from lightpage.calibration.likelihood.statistics import Statistics
 from lightpage.calibration.likelihood.table import FLAT_FIELD, pilot_tensors
-from lightpage.calibration.sampling_table import SamplingTable
+from lightpage.calibration.sampling_table import SamplingTable, shifted
 from lightpage.device.profile import Profile
 from lightpage.page.correction import wrapped
 from lightpage.page.pilots import Pilots
@@ -27,6 +28,7 @@ from lightpage.runtime.model.execution.estimator_graph import (
     NUISANCE_COVARIANCE,
     EstimatorGraph,
 )
+from lightpage.runtime.model.execution.page_graph import REGISTRATION
 from lightpage.waves.grid import symbol_samples
 
 Real = NDArray[np.float64]
@@ -39,6 +41,8 @@ _DAMPING = 0.2
 """Precision that damped steps of tilt and shift get beside their own, over what the phases take up of it."""
 _LEAST_DIFFERENCE_RAD = 0.01
 """Least difference of two symbols' phases that is one."""
+_PLACING_STEPS = 2
+"""Steps, at most, that show where the image of a known page lies."""
 _UNIT_NOISE = np.array([1, 0], np.float32)
 """Noise with which concentrations are the Fisher information."""
 
@@ -215,7 +219,7 @@ class _KnownPages:
     ) -> None:
         self._graph = graph
         self._pages = pages
-        self._feeds = [page.feeds(mask) for page in pages]
+        self._feeds = [_placed(graph, page.feeds(mask)) for page in pages]
         self._mask = mask
         self._data = ~mask
         self._no_flat_fields = np.zeros((len(pages), *mask.shape))
@@ -276,6 +280,17 @@ class _KnownPages:
                 best = flat, by_others
                 most = bits
         return best
+
+
+def _placed(graph: EstimatorGraph, feeds: dict[str, NDArray[np.generic]]) -> dict[str, NDArray[np.generic]]:
+    """Return what a page is fed with, and the registration where its image lies, as a tracker feeds it.
+
+    Known pages of a device that walks lie off the calibration, which has their mean. Pages that are read do not.
+    """
+    state = graph.first_estimate(feeds)
+    for number in range(1, min(_PLACING_STEPS, graph.most_steps) + 1):
+        state = graph.step(state, feeds, number)
+    return {**feeds, REGISTRATION: shifted(graph.value(REGISTRATION), state["nuisance"][SHIFT])}
 
 
 def _with_noise(p: NDArray[np.float32], noise: NDArray[np.float32]) -> NDArray[np.float32]:
