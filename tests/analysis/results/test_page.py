@@ -2,6 +2,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from click.testing import CliRunner, Result
 
 from analysis.results.measurements import Measurement, kept_measurements
@@ -10,6 +11,7 @@ from lightpage.codec.code import Code
 from lightpage.device.profile import load_profile
 from lightpage.device.state import Device
 from lightpage.metrics.provenance import PROVENANCE, Provenance
+from lightpage.page.symbols import pilot_mask
 from lightpage.run_files import BEGUN
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.bundle.shipped import bundle_path
@@ -61,6 +63,9 @@ def test_the_readme_says_what_the_kept_figures_say() -> None:
     told = [row for row in told if row[0] in README]
     found = [(name, Results(kept).outcome("sheared", -0.6, method)) for name, method in README.items()]
     assert told == [[name, f"{of['air']:.2f}", f"{of['page_kB']:.2f}"] for name, of in found if of is not None]
+    waves = kept["waves-bench_-0.6deg_32e_1x_4px"].figures["rows"][-1]["air"]
+    data = np.count_nonzero(~pilot_mask(load_profile("bench")))
+    assert f"| Lightpage, fitted waves, no training | **{waves:.2f}** | **{waves * data / 8000:.2f}** |" in readme
     shipped = kept["evaluation"].figures["air_bits_per_symbol"]
     assert f"reads **{shipped:.2f} bits a symbol**" in " ".join(readme.split())
     ledger = kept["ledger"].figures
