@@ -47,7 +47,7 @@ LOSS = 1e-6
 VOLUME = 7
 _SEED = 90_000
 _KNOWN = 20
-"""Pages that a first user's code is chosen on."""
+"""Pages on which the code of a bundle by the waves is chosen."""
 
 
 @dataclass(frozen=True)
@@ -81,11 +81,6 @@ def _kept(folder: str, method: str = COHERENT, refinements: int = 1) -> Callable
     return made
 
 
-def _by_waves(profile: Profile, device: Device, known: int, near: Path | None = None) -> Callable[[Path], Path]:
-    """Make a bundle by two known pages, whose code is chosen on so many others; see `bundle_by_waves`."""
-    return lambda work: bundle_by_waves(work / "device", profile, device, known, _SEED, near=near)[1]
-
-
 def data_sets(pages: int) -> dict[str, DataSet]:
     """Every data set by name; `pages` are those of the bench device."""
 
@@ -96,7 +91,11 @@ def data_sets(pages: int) -> dict[str, DataSet]:
     def by_waves(name: str, folder: str, pages: int) -> DataSet:
         profile, device, _ = data_set_of(WEIGHTS / folder)
         near = WEIGHTS / folder / "calibration.toml" if profile.name == "paper" else None
-        return DataSet(name, _by_waves(profile, device, _KNOWN, near), profile, device, 0, pages)
+
+        def made(work: Path) -> Path:
+            return bundle_by_waves(work / "device", profile, device, _KNOWN, _SEED, near=near)[1]
+
+        return DataSet(name, made, profile, device, 0, pages)
 
     sets = [
         DataSet("bright", lambda _: bundle_path("bench"), load_profile("bench"), Device(), 120, pages),

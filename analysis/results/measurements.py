@@ -34,8 +34,9 @@ EVALUATION, DEMO, IMAGE_SEARCH, LEDGER, TOLERANCES = "evaluation", "demo", "imag
 PAGE_CODE = "page-code"
 SPEED = "speed-"
 """Before the name of a profile."""
-BOUND, WAVES = "bound-", "waves-"
-"""Before the name of a data set."""
+BOUND = "bound-"
+WAVES = "waves-"
+"""Before the name of a data set, as `BOUND`."""
 
 
 @dataclass(frozen=True)
@@ -188,8 +189,9 @@ def speed(figures: Figures) -> Figures:
 
 
 def _light(profile_toml: str, device: Figures) -> Figures:
-    """Return what tells the light of a simulated device."""
-    profile, sensor = parse_profile(profile_toml, "figures"), device["sensor"]
+    """Return the settings of a simulated device that its light depends on most."""
+    profile = parse_profile(profile_toml, "figures")
+    sensor = device["sensor"]
     return {
         "profile": profile.name,
         "angle_deg": device["geometry"]["pipe_angle_deg"],

@@ -129,8 +129,8 @@ class Results:
         """Return the figures of the fitted waves by light, the brightest first, each with the bound of its light."""
         known = [of.figures for name, of in self.measurements.items() if name.startswith(WAVES)]
         bounds = [self.bound_of(each["profile"], *(each[key] for key in _DATA_SET)) for each in known]
-        found = [(each, light) for each, light in zip(known, bounds, strict=True) if light is not None]
-        return sorted(found, key=lambda pair: -pair[1]["bits"])
+        pairs = [(each, light) for each, light in zip(known, bounds, strict=True) if light is not None]
+        return sorted(pairs, key=lambda pair: -pair[1]["bits"])
 
     def bound(self, name: str, outcome: Figures) -> Figures | None:
         """Return the bound of a comparison's light, None where it is not known or the device has no defects."""

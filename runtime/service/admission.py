@@ -201,7 +201,9 @@ class Slots:
         """Return what was lately taken, the shortest first; `whole`: what all steps would have taken."""
         since = self._clock.now() - FORGET_S
         with self._lock:
-            return sorted(seconds + whole * skipped for ended, seconds, skipped in self._lately if ended >= since)
+            return sorted(
+                seconds + (skipped if whole else 0.0) for ended, seconds, skipped in self._lately if ended >= since
+            )
 
     def _wait(self, ticket: _Ticket, caller: Caller) -> None:
         with caller.telling(ticket.told.set):

@@ -165,7 +165,8 @@ class Caller:
         least_steps: int = 0,
     ) -> None:
         self.seconds_left, self.session, self.stateless = seconds_left, session, stateless
-        self.actor, self.least_steps = actor, least_steps
+        self.actor = actor
+        self.least_steps = least_steps
         self._lock = threading.Lock()
         self._left = threading.Event()
         self._listeners: list[Callable[[], None]] = []
@@ -173,7 +174,8 @@ class Caller:
     def in_session(self, session: str, stateless: bool, least_steps: int = 0) -> Caller:
         """The same caller, whose pages are followed so; when one of both leaves, the other has left too."""
         other = copy(self)
-        other.session, other.stateless, other.least_steps = session, stateless, least_steps
+        other.session, other.stateless = session, stateless
+        other.least_steps = least_steps
         return other
 
     @property

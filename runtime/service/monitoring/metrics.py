@@ -241,10 +241,10 @@ def _load(decodes: Slots, received: ReceiveBudget) -> Iterator[Metric]:
 
 def _steps(usual_s: Callable[[], Sequence[float]]) -> Iterator[Metric]:
     """Yield the usual time of a page's inference with 1, 2, ... steps."""
-    told = GaugeMetricFamily("lightpage_steps_seconds", "Usual inference with so many steps.", labels=["steps"])
+    usual = GaugeMetricFamily("lightpage_steps_seconds", "Usual inference with so many steps.", labels=["steps"])
     for steps, seconds in enumerate(usual_s(), 1):
-        told.add_metric([str(steps)], seconds)
-    yield told
+        usual.add_metric([str(steps)], seconds)
+    yield usual
 
 
 def _batches(pages: UnderWay, largest: Callable[[], int]) -> Iterator[Metric]:

@@ -239,7 +239,8 @@ class PhaseEstimator(nn.Module):
         by_turn = symbol[0] * back[1] - symbol[1] * back[0]
         by_sample = by_turn + to_samples(slope, self.samples) * by_log
         by_nuisance = self.nuisances.gradient(light.leaving, at_exit, light.field, score, THINNED if thinned else 1)
-        by_phase, by_amplitude = summed(by_sample, self.samples), summed(by_log, self.samples)
+        by_phase = summed(by_sample, self.samples)
+        by_amplitude = summed(by_log, self.samples)
         return Likelihood(by_phase, by_nuisance, expected, by_sample, by_amplitude)
 
     def expected_counts(
