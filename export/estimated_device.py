@@ -35,14 +35,14 @@ from lightpage.runtime.model.execution.table_graph import HeldTable
 from lightpage.runtime.recalibration.estimator import check_counts
 from lightpage.runtime.recalibration.from_nominal import recorded_pages
 from lightpage.runtime.recalibration.noise import MOST_STEPS, KnownPhases, deviation_prior_scale, measured_noise
-from lightpage.train.models.likelihood.estimator import PhaseEstimator
+from lightpage.train.models.likelihood.estimator import Estimate, PhaseEstimator
 from lightpage.train.models.likelihood.torch_likelihood import TorchLikelihood
 from lightpage.train.models.twin import RayTwin, TorchTwin
 from lightpage.train.trainers.whole_run import own_pilots
 
-MOST_THINNED_ERROR = 1.01
-"""Largest error of phases with the thinned grid, over that without, for which it is used. On the bench device it is
-1.00 in bright light and 1.02 at 32 electrons."""
+MOST_START_ERROR = 1.05
+"""Error of phases, over that after two fine steps, up to which they are as good. On the bench device it is 1.21 after
+one fine step in bright light and 1.03 at 32 electrons. After a coarse step and a fine one it is 1.01 and 1.02."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ def estimated_device(
     table[DEVIATION_PRECISION] = NO_DEVIATIONS
     table[PIXEL_GAINS] = blemishes.unit_gains  # the known pages have been corrected
     optional = (*device.apart_inputs, PIXEL_GAINS)
-    estimator.thinned = _thinned_grid_suffices(estimator, table, KnownPhases.of(pages[0], device), mask)
+    estimator.coarse_start = coarse_start_pays(estimator, table, KnownPhases.of(pages[0], device), mask)
     progress("graphs to ONNX", 0.0)
     graphs = estimator_files(estimator, pages[0].pair.in_phase.dtype.name, optional, table)
     progress("noise of the known pages", 0.0)
@@ -141,29 +141,34 @@ def estimated_device(
     return EstimatedDevice(device, twin, estimator, graphs, table, optional, pages, last_pair, mask, own)
 
 
-def _thinned_grid_suffices(
+def coarse_start_pays(
     estimator: PhaseEstimator, table: SamplingTable, known: KnownPhases, mask: NDArray[np.bool_]
 ) -> bool:
-    """Return whether a known page's phases are as good after two steps if the first one uses the thinned grid."""
+    """Return whether the first step should predict light coarsely.
+
+    It should where a known page needs a second step even after a fine one, and the second step mends a coarse one.
+    """
     tensors = {name: torch.from_numpy(np.array(value, order="C")) for name, value in table.items()}
     feeds = {name: torch.from_numpy(np.array(value)) for name, value in known.feeds(mask).items()}
     frames = feeds.pop("in_phase"), feeds.pop("quadrature")
     tensors |= feeds
     noise = tensors[NOISE][0]
-    deviations: list[float] = []
     with torch.no_grad():
         operators = estimator.operators(tensors)
         cameras = estimator.recovery.cameras(*(tensors[name] for name in APART if name in tensors))
         first, page, _ = estimator.first(operators, tensors, noise, *frames)
-        for thinned in (True, False):
-            estimator.thinned = thinned
-            estimate = first
-            for coarse in (True, False):
-                likelihood = estimator.likelihood(operators, tensors, page, estimate, cameras, coarse=coarse)
-                estimate, _ = estimator.advanced(tensors, page, estimate, likelihood, noise, coarse=coarse)
-            error = wrapped(torch.atan2(estimate.p[1], estimate.p[0]).numpy().astype(np.float64) - known.phases)
-            deviations.append(float(np.median(np.abs(error))))
-    return deviations[0] <= MOST_THINNED_ERROR * deviations[1]
+
+        def after_step(estimate: Estimate, *, coarse: bool = False) -> Estimate:
+            likelihood = estimator.likelihood(operators, tensors, page, estimate, cameras, coarse=coarse)
+            return estimator.advanced(tensors, page, estimate, likelihood, noise, start=True)[0]
+
+        def error(estimate: Estimate) -> float:
+            phases = torch.atan2(estimate.p[1], estimate.p[0]).numpy().astype(np.float64)
+            return float(np.median(np.abs(wrapped(phases - known.phases))))
+
+        one_fine = after_step(first)
+        largest = MOST_START_ERROR * error(after_step(one_fine))
+        return error(one_fine) > largest >= error(after_step(after_step(first, coarse=True)))
 
 
 def _pilots(device: CalibratedDevice, mask: NDArray[np.bool_], own: NDArray[np.float32] | None) -> Pilots:

@@ -122,7 +122,7 @@ class StepGraph(nn.Module):
     Args:
         estimator, structure, used: see `FirstGraph`.
         apart: names of the tensors of cameras in different planes.
-        coarse: see `PhaseEstimator.likelihood`.
+        start: whether this is the first step.
 
     Attributes:
         names: names of the table's tensors that are inputs.
@@ -135,14 +135,14 @@ class StepGraph(nn.Module):
         structure: tree.TreeSpec,
         used: Sequence[int],
         *,
-        coarse: bool,
+        start: bool,
     ) -> None:
         super().__init__()
         self.estimator = estimator
         self._apart = apart
         self._structure = structure
         self._used = tuple(used)
-        self._coarse = coarse
+        self._start = start
         self.names = (*STEP, *apart)
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
@@ -154,8 +154,9 @@ class StepGraph(nn.Module):
         table = dict(zip(self.names, islice(remaining, len(self.names)), strict=True))
         operators = restored(self._structure, self._used, [*remaining])
         cameras = self.estimator.recovery.cameras(*(table[name] for name in self._apart))
-        likelihood = self.estimator.likelihood(operators, table, page, estimate, cameras, coarse=self._coarse)
-        advanced, chi_square = self.estimator.advanced(table, page, estimate, likelihood, noise, coarse=self._coarse)
+        coarse = self._start and self.estimator.coarse_start
+        likelihood = self.estimator.likelihood(operators, table, page, estimate, cameras, coarse=coarse)
+        advanced, chi_square = self.estimator.advanced(table, page, estimate, likelihood, noise, start=self._start)
         return *answers(advanced.p), advanced.nuisance, advanced.deviations, chi_square, *likelihood
 
 
@@ -189,10 +190,11 @@ class WholeGraph(nn.Module):
         estimate, page, residual = self.estimator.first(operators, table, table[NOISE][0], in_phase, quadrature)
         chi_square = torch.zeros_like(residual)
         for number in range(self.steps):
-            coarse = number < EARLY_STEPS
+            start = number < EARLY_STEPS
+            coarse = start and self.estimator.coarse_start
             likelihood = self.estimator.likelihood(operators, table, page, estimate, cameras, coarse=coarse)
             noise = table[NOISE][number + 1]
-            estimate, chi_square = self.estimator.advanced(table, page, estimate, likelihood, noise, coarse=coarse)
+            estimate, chi_square = self.estimator.advanced(table, page, estimate, likelihood, noise, start=start)
         return *answers(estimate.p), residual, estimate.nuisance, chi_square
 
 
@@ -253,16 +255,16 @@ def estimator_files(
     step_inputs = (*(state[name] for name in ESTIMATE), tensors[NOISE][1], *(state[name] for name in PAGE))
     first_names = (*FRAME_INPUTS, NOISE, *first_graph.names, *(names[index] for index in backward))
 
-    def step_model(used: tuple[int, ...], *, coarse: bool) -> onnx.ModelProto:
-        graph = StepGraph(estimator, apart, structure, used, coarse=coarse)
+    def step_model(used: tuple[int, ...], *, start: bool) -> onnx.ModelProto:
+        graph = StepGraph(estimator, apart, structure, used, start=start)
         inputs = (*step_inputs, *(tensors[name] for name in graph.names), *(operators[index] for index in used))
         input_names = (*ESTIMATE_INPUTS.values(), NOISE, *PAGE, *graph.names, *(names[index] for index in used))
         return exported(graph, inputs, input_names, STEP_OUTPUTS, None)
 
     device = exported(device_graph, device_inputs, OPERATOR_INPUTS, names, None)
     first = exported(first_graph, first_inputs, first_names, first_outputs, None)
-    early = step_model(backward, coarse=True)
-    step = step_model(everything, coarse=False)
+    early = step_model(backward if estimator.coarse_start else everything, start=True)
+    step = step_model(everything, start=False)
     move_device_constants(device, {"first": first, "early": early, "step": step}, {*names, *OF_DEVICE})
     for model in (device, first, early, step):
         onnx.checker.check_model(model)

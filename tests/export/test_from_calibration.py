@@ -27,7 +27,7 @@ from lightpage.errors import (
     InvalidInputError,
     ProfileError,
 )
-from lightpage.export import from_calibration, proof
+from lightpage.export import estimated_device, from_calibration, proof
 from lightpage.export.commands.calibrate import calibrate
 from lightpage.export.from_calibration import export_calibration
 from lightpage.metrics.measures import measure
@@ -143,6 +143,18 @@ def test_one_graph_says_what_the_repeated_step_says(bundle: Path) -> None:
     (p,) = whole.run(["p"], feeds)
     repeated = decoder.infer(golden.pair).p
     assert np.linalg.norm(p - repeated) < 1e-3 * np.linalg.norm(p)
+
+
+def test_a_first_step_that_predicts_light_finely_reads_more(
+    bundle: Path, calibration: Calibration, small_device: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(estimated_device, "coarse_start_pays", lambda *device: False)
+    out = tmp_path / "fine.zip"
+    with Recording.open(small_device[3]) as recording:
+        export_calibration(calibration, recording, PROFILE, out, steps=STEPS)
+    coarse, fine = (Decoder.load(path, steps=1) for path in (bundle, out))
+    recording_path = Path(small_device[3])
+    assert air(fine, recording_path, range(4, 8)) > air(coarse, recording_path, range(4, 8)) + 0.1
 
 
 def test_a_drifted_device_is_recalibrated_without_torch(bundle: Path, tmp_path: Path) -> None:

@@ -32,7 +32,8 @@ NUISANCE_COVARIANCE = "nuisance_covariance"
 NOISE = "noise"
 """Noise of the first estimate and after each step, one row each."""
 EARLY_STEPS = 1
-"""Number of first steps that predict the light coarsely. Later steps correct their errors."""
+"""Number of first steps that leave the deviations at zero. In bright light they predict the light coarsely, and later
+steps correct their errors."""
 EXPECTED = "expected"
 """Output of a step: expected counts of both cameras at the estimate it was given."""
 DERIVATIVES = ("by_phase", "by_nuisance", EXPECTED)
@@ -53,7 +54,8 @@ class EstimatorFiles(NamedTuple):
     Attributes:
         operators: graph from a device's table to the wave operators, which the other graphs take.
         first: graph from frames to the first estimate.
-        early, step: graphs from an estimate to the next one, with coarsely and accurately predicted light.
+        early: graph from the first estimate to that after the first step.
+        step: graph from an estimate to the next one.
         constants: contents of files that the graphs share constants with, by name.
     """
 

@@ -138,7 +138,7 @@ class PhaseEstimator(nn.Module):
         forward, backward: fidelity of the waves either way.
 
     Attributes:
-        thinned: whether coarse steps use the thinned grid. Its counts say less where noise is strong.
+        coarse_start: whether the first step predicts light coarsely. A fine one says more where noise is strong.
     """
 
     def __init__(
@@ -153,7 +153,7 @@ class PhaseEstimator(nn.Module):
         # the root nearest to the linear field is enough: the first step mends more than rounds of its own would
         self.recovery = FieldRecovery(profile, rounds=0, grid=grid, corrected=True)
         self.samples = symbol_samples(profile)
-        self.thinned = True
+        self.coarse_start = True
         self.waves = Waves(profile, parameters, self.samples, forward, filled=True, grid=grid)
         self.back = Waves(profile, parameters, self.samples, backward, filled=True, grid=grid, thinned=True)
         self.nuisances = PageNuisances(profile, self.waves.geometry, self.waves.cells, self.recovery.grid)
@@ -220,12 +220,12 @@ class PhaseEstimator(nn.Module):
             operators, page, estimate: see there.
             table: `homodyne`, `amplitude_series`, `count_scale`, `count_weights`.
             cameras: defocus of cameras that stand apart.
-            coarse: whether light is predicted with the fidelity of the way back and on the thinned grid, as is enough
-                for a first step.
+            coarse: whether light is predicted with the fidelity of the way back and, unless cameras stand apart, on the
+                thinned grid.
         """
         direction, turned = estimate.direction, phasor(estimate.deviations)
         amplitude, slope = amplitude_and_slope(direction, table["amplitude_series"])
-        thinned = coarse and self.thinned and cameras is None  # cameras in different planes need neighbouring samples
+        thinned = coarse and cameras is None  # cameras in different planes need neighbouring samples
         page = page.thinned if thinned else page
         light = self._predicted(operators, amplitude, estimate, coarse=coarse, thinned=thinned)
         score, expected = _score(table, page, light.field, cameras)
@@ -288,7 +288,7 @@ class PhaseEstimator(nn.Module):
         likelihood: Likelihood,
         noise: Tensor,
         *,
-        coarse: bool = False,
+        start: bool = False,
     ) -> tuple[Estimate, Tensor]:
         """Move an estimate by the Gauss-Newton step of all phases and nuisance parameters together.
 
@@ -306,7 +306,7 @@ class PhaseEstimator(nn.Module):
             page, estimate: see there.
             likelihood: derivatives at the estimate, see `likelihood`.
             noise: see `_concentration`, [2].
-            coarse: whether light was predicted coarsely; deviations would follow its errors, and stay.
+            start: whether this is the first step: deviations would follow the errors of the phases, and stay.
 
         Returns:
             The next estimate, and the mean square of the counts' residuals over their variance, [].
@@ -322,7 +322,7 @@ class PhaseEstimator(nn.Module):
         right_hand_side = gradient - prior - (responses * likelihood.by_phase).sum((1, 2))
         change = table["nuisance_covariance"] @ right_hand_side / gain2
         hessian = self._hessian(table, estimate, slope, information)
-        step, deviations = hessian.solve(likelihood.by_sample, None if coarse else estimate.deviations)
+        step, deviations = hessian.solve(likelihood.by_sample, None if start else estimate.deviations)
         step = step - (responses * change[:, None, None]).sum(0)
         step = torch.clamp(step, -LARGEST_STEP_RAD, LARGEST_STEP_RAD)
         by_amplitude = likelihood.by_amplitude * (1 + slope * slope) / information

@@ -16,11 +16,14 @@ from lightpage.calibration.sampling_table import APART, SamplingTable
 from lightpage.calibration.waves.wave_fit import WaveFit
 from lightpage.calibration.waves.wave_model import LaunchConditions
 from lightpage.device.state import CameraPose, Device, Drift, Sensor, SlmDefects
+from lightpage.export.estimated_device import coarse_start_pays
 from lightpage.page.correction import wrapped
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import random_symbols, symbol_phases
 from lightpage.recording.frame_pair import FramePair
-from lightpage.runtime.model.execution.estimator_graph import EARLY_STEPS, NO_DEVIATIONS
+from lightpage.runtime.model.execution.estimator_graph import DEVIATION_PRECISION, EARLY_STEPS, NO_DEVIATIONS
+from lightpage.runtime.model.execution.estimator_graph import NOISE as NOISE_ROWS
+from lightpage.runtime.recalibration.noise import KnownPhases
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import perfectly_calibrated
 from lightpage.train.models.likelihood.estimator import Estimate, Likelihood, Operators, Page, PhaseEstimator
@@ -192,8 +195,9 @@ class Fitted:
         estimates, chi_squares = [estimate], []
         for number in range(steps):
             early = number < EARLY_STEPS
-            found = self.estimator.likelihood(operators, table, page, estimates[-1], coarse=early)
-            estimate, chi_square = self.estimator.advanced(table, page, estimates[-1], found, NOISE, coarse=early)
+            coarse = early and self.estimator.coarse_start
+            found = self.estimator.likelihood(operators, table, page, estimates[-1], coarse=coarse)
+            estimate, chi_square = self.estimator.advanced(table, page, estimates[-1], found, NOISE, start=early)
             estimates.append(estimate)
             chi_squares.append(float(chi_square))
         return estimates, chi_squares
@@ -247,14 +251,26 @@ def test_every_step_comes_nearer_to_the_page(fitted: Fitted, pages: tuple[np.nda
 
 
 def test_in_dim_light_concentrations_tell_which_symbols_are_right() -> None:
-    dim = STILL.model_copy(update={"sensor": Sensor(full_well_e=32, exposure_relative=0.03)})
+    dim = STILL.model_copy(update={"sensor": Sensor(full_well_e=32, exposure_relative=0.06)})
     phases = symbol_phases(written(2), 256)
-    estimates, _ = fitted_to(dim).read(Simulator(PROFILE, dim, seed=2).page(written(2)), phases)
+    fitted = fitted_to(dim)
+    fitted.estimator.coarse_start = False
+    estimates, _ = fitted.read(Simulator(PROFILE, dim, seed=2).page(written(2)), phases)
     agreement = np.cos(decoded(estimates[-1]) - phases)[~MASK]
     concentrations = np.hypot(*estimates[-1].p.numpy())[~MASK]
     sure = concentrations > np.median(concentrations)
     assert 0.2 < agreement.mean() < 0.9  # neither lost nor all right
     assert agreement[sure].mean() > agreement[~sure].mean() + 0.1
+
+
+@pytest.mark.parametrize(("electrons", "exposure", "pays"), [(15_000, 1, True), (32, 1, False), (32, 0.06, False)])
+def test_a_coarse_start_pays_in_bright_light_only(electrons: float, exposure: float, *, pays: bool) -> None:
+    state = STILL.model_copy(update={"sensor": Sensor(full_well_e=electrons, exposure_relative=exposure)})
+    fitted = fitted_to(state)
+    phases = symbol_phases(written(2), 256)
+    known = KnownPhases(Simulator(PROFILE, state, seed=2).page(written(2)), phases)
+    table = fitted.table | {NOISE_ROWS: np.array([[1, 0]], np.float32), DEVIATION_PRECISION: NO_DEVIATIONS}
+    assert coarse_start_pays(fitted.estimator, table, known, MASK) == pays
 
 
 def test_a_shift_of_the_image_is_found(fitted: Fitted, pages: tuple[np.ndarray, FramePair, FramePair]) -> None:
