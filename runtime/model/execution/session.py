@@ -27,6 +27,15 @@ _NUMPY_NAMES = {"float": "float32", "double": "float64"}
 """Of the types whose names differ in ONNX."""
 
 
+# Sessions share one arena. Graphs that run in turn then need as much memory as the largest of them.
+onnxruntime.create_and_register_allocator(
+    onnxruntime.OrtMemoryInfo(
+        "Cpu", onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, onnxruntime.OrtMemType.DEFAULT
+    ),
+    onnxruntime.OrtArenaCfg({}),
+)
+
+
 @dataclass(frozen=True)
 class Port:
     """Numpy type and shape of a graph's input or output; None stands for a free dimension."""
@@ -71,6 +80,7 @@ CUDA_VERSION: str = getattr(onnxruntime, "cuda_version", "")
 _USABLE = "a GPU of that number with room for the model, its driver and its libraries"
 _VERSION_DIGITS = 16
 _FATAL_ONLY = 4
+_SHARED_ARENA = "session.use_env_allocators"
 _NOWHERE = os.path.join(os.sep, "nonexistent", "lightpage")
 
 
@@ -113,6 +123,8 @@ def open_session(
     if once:
         options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
         options.enable_cpu_mem_arena = False
+    else:
+        options.add_session_config_entry(_SHARED_ARENA, "1")
     if profile is not None:
         options.enable_profiling, options.profile_file_prefix = True, str(profile)
     # A model that names an outside file for its weights must not read this machine's files.
