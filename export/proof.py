@@ -8,7 +8,7 @@ from pathlib import Path
 from lightpage.errors import BundleError
 from lightpage.progress import Progress
 from lightpage.recording.reader import Recording
-from lightpage.runtime.archives.recordings.new_bundle import with_code
+from lightpage.runtime.archives.recordings.new_bundle import judged_manifest
 from lightpage.runtime.model.bundle.bundle import write_bundle
 from lightpage.runtime.model.bundle.manifest import Manifest, check_version
 from lightpage.runtime.model.decoding.batch_graph import with_proven_batches
@@ -33,7 +33,8 @@ def proven(
     """Load the bundle beside `out` as the service does.
 
     Returns:
-        its manifest, with a code where a recording chose one, and its files, those for many pages only if they decode.
+        its manifest, with the code and the verdict of a recording's pages, and its files, those for many pages only if
+        they decode.
 
     Raises:
         RecordingError: the recording is of another device.
@@ -46,9 +47,8 @@ def proven(
         decoder = Decoder.load(partial)
         files = dict(with_proven_batches(decoder.bundle, decoder.graph).files)
         if recording is not None:
-            progress("choose the code of user bytes", 0.9)
             with Recording.open(recording) as pages:
-                manifest = with_code(decoder, pages, manifest)
+                manifest = judged_manifest(decoder, pages, manifest, progress)
     finally:
         _remove(partial)
     return manifest, files

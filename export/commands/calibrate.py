@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tempfile
 import time
 from pathlib import Path
 
@@ -35,6 +36,7 @@ _DOTS = 150
 MAX_PAGES = 4
 """More cost time and add nothing that a decoder would notice."""
 _CPU = "cpu"
+_BUNDLE = "bundle.zip"
 _NO_GRAPHS = "none"
 """Choice of torch in place of a bundle's graphs."""
 
@@ -85,8 +87,9 @@ def calibrate(
 ) -> None:
     """Find this device's geometry, from nominal, with the first pages of a recording that show light.
 
-    The fit is called good where a decoder loses less than 0.1 bit a symbol by what it leaves unexplained, usable
-    below 0.3, else wrong. A wrong one is written too, but over no better one, and ends the command with an error.
+    Up to four further known pages are then read. The fit is good where they read 0.95 of what their light holds, usable
+    where a code carries them, else wrong. Without further pages it is not judged. A wrong one is written too, but over
+    no better one, and ends the command with an error.
     """
     start = time.perf_counter()
     if compute != _CPU:
@@ -112,10 +115,26 @@ def calibrate(
             except LightpageError as lacking:
                 expected = f"{error.expected}, or torch for graphs of this device: {lacking}"
                 raise CalibrationError(error.subject, error.got, expected) from None
-    seconds = time.perf_counter() - start
-    kept = calibration.is_wrong and _is_better(out)
-    if not kept:
-        calibration.save(out)
+        seconds = time.perf_counter() - start
+        if not out.exists():
+            calibration.save(out)  # an interrupted reading loses nothing
+        with tempfile.TemporaryDirectory(dir=None if bundle is None else bundle.parent) as folder:
+            written = Path(folder) / (_BUNDLE if bundle is None else bundle.name)
+            read = bundle is not None or (file.pages > len(chosen) and calibration.statistics is not None)
+            try:
+                judged = _judged(decoder, calibration, file, profile, written if read else None, progress)
+            except LightpageError as error:
+                if bundle is not None:
+                    calibration.save(out)
+                    raise
+                warn(f"pages that the fit has not seen are not read: {error}")
+                judged = calibration.judged(None)
+            calibration = judged
+            kept = calibration.is_wrong and _is_better(out)
+            if not kept:
+                calibration.save(out)
+            if bundle is not None and not calibration.is_wrong:
+                written.replace(bundle)
     lost = _symbols_beside_cameras(decoder, calibration, profile)
     if json_path is not None:
         write_json(json_path, figures(calibration, profile, seconds, lost))
@@ -133,15 +152,13 @@ def calibrate(
         f"\ncoherence {calibration.coherence_before:.3f} -> {calibration.coherence_after:.3f}, "
         f"{calibration.pages_used} known pages, {seconds:.0f} s; {'not ' * kept}written to {out}"
     )
-    if found is not None and found.verdict == "good":
-        click.echo(f"a good fit: about {found.bits_lost:.2f} bit a symbol lost to light that it does not explain")
     remedy = "the file keeps a better one: name another --out" if kept else "the file is there to be looked at"
     without = "" if bundle is None else f", and {bundle} is not written"
     calibration.check_good(f"calibration {out}", f"; {remedy}{without}")
+    if found is not None:
+        click.echo(calibration.verdict_sentence)
     if bundle is not None:
-        with Recording.open(recording) as file, percent_bar() as progress:
-            exported = _exported(decoder, calibration, file, profile, bundle, progress)
-        click.echo(f"{bundle}: version {exported.version}, after {time.perf_counter() - start:.0f} s")
+        click.echo(f"{bundle}: version {Bundle.open(bundle).version}, after {time.perf_counter() - start:.0f} s")
 
 
 def _calibrated(
@@ -164,6 +181,23 @@ def _calibrated(
         raise missing(f"lightpage calibrate, profile {profile.name}", error) from error
     device = torch_device(compute)
     return calibrate_recording(recording, profile, pages, progress, any_orientation=not upright, compute=device)
+
+
+def _judged(
+    decoder: Decoder | None,
+    calibration: Calibration,
+    recording: Recording,
+    profile: Profile,
+    out: Path | None,
+    progress: Progress,
+) -> Calibration:
+    """Judge a calibration by pages that its fit has not seen, and write its bundle to `out`; None to read nothing."""
+    if out is None:
+        return calibration.judged(None)
+    try:
+        return _exported(decoder, calibration, recording, profile, out, progress).calibration
+    except CalibrationError as error:  # its own pages contradict it
+        return calibration.contradicted(error.got)
 
 
 def _exported(
@@ -217,6 +251,7 @@ def figures(calibration: Calibration, profile: Profile, seconds: float, lost: in
         "modulation": calibration.modulation,
         "symbols_beside_cameras": lost,
         "goodness": None if calibration.goodness is None else calibration.goodness.model_dump(),
+        "reading": None if calibration.reading is None else calibration.reading.model_dump(),
         "blemishes": None if calibration.blemishes is None else calibration.blemishes.model_dump(),
     }
 

@@ -13,7 +13,8 @@ from pydantic import AfterValidator, Field, field_serializer
 
 from lightpage.calibration.calibrate import Registered
 from lightpage.calibration.calibrated_device import CalibratedDevice
-from lightpage.calibration.goodness.verdict import USABLE, Goodness
+from lightpage.calibration.goodness.suspects import unlike_profile
+from lightpage.calibration.goodness.verdict import GOOD, NOT_JUDGED, USABLE, Goodness, Reading
 from lightpage.calibration.likelihood.statistics import Statistics
 from lightpage.calibration.parameters import KNOWN, NAMES, as_dict, as_vector
 from lightpage.device.profile import Count, Finite, Profile, TomlTable, to_toml, validate
@@ -44,7 +45,7 @@ _ADDED = {
 independent of those beside them."""
 
 
-_OPTIONAL = ("turn_deviation_rad", "coherence_at_first", "goodness", "statistics", "blemishes")
+_OPTIONAL = ("turn_deviation_rad", "coherence_at_first", "goodness", "reading", "statistics", "blemishes")
 
 
 def _names_problem(values: dict[str, Any], names: tuple[str, ...] = NAMES) -> str:
@@ -124,6 +125,7 @@ class Calibration(TomlTable):
             in documents that do not tell it.
         modulation_deviations: standard deviations of that, same names.
         goodness: how well the fit explains the light; None where that was not measured, as in documents of before.
+        reading: what was read of known pages; None where none was read.
         statistics: statistics of the light and of the cameras' counts; None in documents of before.
         blemishes: numbers of the cameras' blemishes that were corrected; None in documents of before.
     """
@@ -144,6 +146,7 @@ class Calibration(TomlTable):
     modulation: Annotated[dict[str, Finite], _just(modulations.NAMES)] = NOMINAL.as_dict()
     modulation_deviations: Annotated[dict[str, NonNegative], _just(modulations.NAMES)] = NOMINAL.as_dict()
     goodness: Goodness | None = None
+    reading: Reading | None = None
     statistics: Statistics | None = None
     blemishes: BlemishCounts | None = None
 
@@ -239,13 +242,50 @@ class Calibration(TomlTable):
         """Angle of the pipe, degrees: the profile's and what was fitted on top."""
         return profile.pipe.angle_deg + float(np.rad2deg(self.parameters["pipe_angle_rad"]))
 
+    def judged(self, reading: Reading | None) -> Self:
+        """The calibration with the verdict of known pages.
+
+        Args:
+            reading: what was read of them; None where no page was read, which leaves the fit not judged.
+        """
+        found = self.goodness
+        if found is None:
+            return self
+        verdict = NOT_JUDGED if reading is None else reading.verdict
+        if reading is None or verdict == NOT_JUDGED:
+            judged = found.model_copy(update={"verdict": verdict})
+            return self.model_copy(update={"goodness": judged, "reading": reading})
+        lost = max(0.0, reading.light_bits - reading.air_bits)
+        other_profile = unlike_profile(self.vector)
+        if verdict == "good" and other_profile:
+            verdict = "usable"
+        cause = other_profile if verdict == "good" else found.cause
+        judged = found.model_copy(update={"verdict": verdict, "bits_lost": lost, "cause": cause})
+        return self.model_copy(update={"goodness": judged, "reading": reading})
+
+    def contradicted(self, cause: str) -> Self:
+        """The calibration as a wrong one, for a cause in words."""
+        found = self.goodness
+        wrong = None if found is None else found.model_copy(update={"verdict": "wrong", "cause": cause})
+        return self.model_copy(update={"goodness": wrong, "reading": None})
+
+    @property
+    def verdict_sentence(self) -> str:
+        """The verdict in words; empty where the fit was not measured."""
+        if self.goodness is None:
+            return ""
+        judged = self.goodness.verdict != NOT_JUDGED
+        verdict = f"a {self.goodness.verdict} fit" if judged else f"{NOT_JUDGED}, for want of further known pages"
+        lost = f"about {self.goodness.bits_lost:.2f} bit a symbol lost to light that the fit does not explain"
+        return f"{verdict}: {lost if self.reading is None else self.reading}"
+
     @property
     def is_wrong(self) -> bool:
-        """Return whether the fit leaves so much light unexplained that it is wrong."""
+        """Return whether the fit is wrong: it reads nothing, or leaves too much light unexplained."""
         return self.goodness is not None and self.goodness.verdict == "wrong"
 
     def check_good(self, subject: str, remedy: str = "; mend the cause and calibrate anew") -> None:
-        """Check that the fit is not wrong; a warning where it is only usable.
+        """Check that the fit is not wrong; a warning where it is only usable, or may be.
 
         Args:
             subject: name of the thing that has the calibration.
@@ -254,12 +294,19 @@ class Calibration(TomlTable):
         Raises:
             CalibrationError: it is wrong.
         """
-        found = self.goodness
+        found, read = self.goodness, self.reading
         if found is None or found.verdict == "good":
             return
-        got = f"a {found.verdict} fit, which costs about {found.bits_lost:.2f} bit a symbol: {found.cause}"
+        if found.verdict == NOT_JUDGED:
+            if found.bits_lost >= GOOD:
+                warn(f"{subject}: about {found.bits_lost:.2f} bit a symbol may be lost: {found.cause}")
+            return
+        cause = f": {found.cause}" if found.cause else ""
+        lost = f"which costs about {found.bits_lost:.2f} bit a symbol" if read is None else str(read)
+        got = f"a {found.verdict} fit, {lost}{cause}"
         if found.verdict == "wrong":
-            raise CalibrationError(subject, got, f"at most {USABLE:g} bit{remedy}")
+            expected = f"at most {USABLE:g} bit" if read is None else "pages that some code carries"
+            raise CalibrationError(subject, got, f"{expected}{remedy}")
         warn(f"{subject}: {got}")
 
     def check_profile(self, profile: Profile) -> None:

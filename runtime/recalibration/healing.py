@@ -305,7 +305,9 @@ class _Healing:
         bundle = model.decoder.bundle
         page = self._known_page(known.pairs[0], known.symbols[0])
         goodness = goodness_of(self._twin, self._near(model), page, lambda _: progress("unexplained light", 1.0))
-        return _Model(*self._with(bundle.calibration.model_copy(update={"goodness": goodness})), model.fitted)
+        return _Model(
+            *self._with(bundle.calibration.model_copy(update={"goodness": goodness, "reading": None})), model.fitted
+        )
 
 
 def _shows_light(decoder: Decoder, pair: FramePair) -> bool:

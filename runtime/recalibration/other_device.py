@@ -53,6 +53,7 @@ def of_other_device(decoder: Decoder, pages: LostPages, progress: Progress) -> D
                 "coherence_after": 0.0,
                 "coherence_at_first": None,
                 "goodness": None,
+                "reading": None,
                 "calibrated_pages": tuple(distinct),
             }
         )

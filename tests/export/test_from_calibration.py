@@ -135,6 +135,17 @@ def test_it_reads_more_than_a_short_training_and_each_step_reads_more(
     assert by_steps[-1] > 6.2
 
 
+def test_pages_that_the_fit_has_not_seen_judge_it(bundle: Path, small_device: list[str]) -> None:
+    decoder = Decoder.load(bundle)
+    reading = decoder.bundle.calibration.reading
+    assert reading is not None
+    assert not reading.in_sample
+    read = air(decoder, Path(small_device[3]), range(len(USED), len(USED) + reading.pages))
+    assert reading.air_bits == pytest.approx(read, abs=0.02)
+    assert reading.light_bits == pytest.approx(read, abs=0.4)
+    assert reading.user_bytes == decoder.page_codec.user_bytes
+
+
 def test_one_graph_says_what_the_repeated_step_says(bundle: Path) -> None:
     decoder = Decoder.load(bundle)
     golden = decoder.bundle.golden

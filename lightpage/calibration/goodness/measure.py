@@ -114,6 +114,8 @@ def measure_goodness(
         by_page=_map(errors, frame_errors, amount, modulator_errors),
         by_facet=_map(residual, frame_noise, amount, modulator_noise),
         cause=cause,
+        frame_error_rad=float(np.sqrt(frames[1])),
+        modulator_error_rad=float(np.sqrt(amount * modulator[1])),
     )
 
 

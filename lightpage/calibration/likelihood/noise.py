@@ -53,6 +53,21 @@ def fitted_noise(errors: Real, information: Real) -> NDArray[np.float32]:
     return np.array([best[0] * np.median(information), best[1]], np.float32)
 
 
+def light_bits(information: Real, frame_error_rad: float, modulator_error_rad: float) -> float:
+    """Information of symbols' light on their phases, bits a symbol.
+
+    The Fisher information of counts takes noise of the modulator for noise of the counts, of which it is no part: it
+    is the same in all samples that a symbol's light reaches. So its share of the errors is replaced by its own.
+
+    Args:
+        information: Fisher information of each symbol's phase.
+        frame_error_rad, modulator_error_rad: standard deviations of a symbol's phase by either noise.
+    """
+    frames, modulator = frame_error_rad**2, modulator_error_rad**2
+    share = frames / (frames + modulator) if modulator > 0 else 1.0
+    return expected_bits(np.array([share, modulator], np.float32), information)
+
+
 def expected_bits(noise: NDArray[np.float32], information: Real) -> float:
     """Expected information of symbols, bits a symbol.
 

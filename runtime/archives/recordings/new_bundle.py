@@ -10,6 +10,7 @@ import numpy as np
 
 from lightpage.calibration.document import Calibration
 from lightpage.calibration.likelihood.table import FLAT_FIELD, PIXEL_GAINS, pilot_tensors
+from lightpage.codec.code import parse_code
 from lightpage.device.profile import Profile
 from lightpage.errors import BundleError, CalibrationError, InvalidInputError, LightpageError, ProfileError
 from lightpage.progress import Progress, note, warn
@@ -18,6 +19,7 @@ from lightpage.recording.layout import page_hashes
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.coded_pages import choose_code
 from lightpage.runtime.archives.recordings.evaluation import check_recording, pilots_of
+from lightpage.runtime.archives.recordings.reading import reading_of
 from lightpage.runtime.model.bundle.bundle import Bundle, npz, residual_limit, write_bundle
 from lightpage.runtime.model.bundle.manifest import GOLDEN, Manifest, Provenance, version_of
 from lightpage.runtime.model.bundle.shipped import DEFAULT, bundle_path
@@ -116,12 +118,11 @@ def bundle_by_graphs(
         progress: called at the beginning of each step, and with its finished share.
 
     Raises:
-        CalibrationError: the calibration is wrong, has no statistics, or belongs to other pages or references.
+        CalibrationError: the calibration has no statistics, or belongs to other pages or references.
         BundleError: `version` is malformed, or `out` cannot be written.
     """
     profile = decoder.bundle.profile
     calibration.check_profile(profile)
-    calibration.check_good("calibration")
     if (statistics := calibration.statistics) is None:
         raise CalibrationError("calibration: statistics", "none", "statistics of the counts: calibrate anew")
     used = calibrated_pages(calibration, recording)
@@ -142,7 +143,6 @@ def bundle_by_graphs(
     assert isinstance(new.graph, EstimatorGraph)  # as that of `decoder`
     for_corrected = new.graph.with_table({PIXEL_GAINS: blemishes.unit_gains})
     check_counts(for_corrected, KnownPhases.of(known[0], device), mask, f"recording {recording.path}, page {used[0]}")
-    progress("choose the code of user bytes", 0.7)
     swapped = FramePair(pair.quadrature, pair.in_phase)
     created = datetime.now(UTC)
     name = name or profile.name
@@ -162,7 +162,7 @@ def bundle_by_graphs(
         }
     )
     new = decoder.of_bundle(replace(fitted, manifest=manifest))
-    manifest = with_code(new, recording, manifest)
+    manifest = judged_manifest(new, recording, manifest, progress)
     golden, p = golden_page(new, pair)
     progress("write the bundle", 0.9)
     files = {**fitted.files, GOLDEN: npz(in_phase=golden.in_phase, quadrature=golden.quadrature, p=p)}
@@ -189,12 +189,24 @@ def calibrated_pages(calibration: Calibration, recording: Recording) -> list[int
     return known[-MOST_PAGES:]
 
 
-def with_code(decoder: Decoder, recording: Recording, manifest: Manifest) -> Manifest:
-    """Return the manifest with a code of user bytes; as it is, with a warning, where the pages allow none.
+def judged_manifest(decoder: Decoder, recording: Recording, manifest: Manifest, progress: Progress) -> Manifest:
+    """Return the manifest with a code of user bytes, and an estimator's with the verdict on its calibration.
 
     Raises:
         RecordingError: the recording is of another device.
     """
+    progress("choose the code of user bytes", 0.7)
+    manifest = _with_code(decoder, recording, manifest)
+    bundle = decoder.bundle
+    if not bundle.is_estimator:
+        return manifest
+    code = None if manifest.code is None else parse_code(manifest.code, bundle.subject)
+    reading = reading_of(decoder, recording, code, progress)
+    return manifest.model_copy(update={"calibration": bundle.calibration.judged(reading).to_toml()})
+
+
+def _with_code(decoder: Decoder, recording: Recording, manifest: Manifest) -> Manifest:
+    """Return the manifest with a code of user bytes; as it is, with a warning, where the pages allow none."""
     try:
         choice, _ = choose_code(decoder, recording, tracker_for(decoder))
     except InvalidInputError as lacking:

@@ -15,9 +15,11 @@ from click.testing import CliRunner
 
 from lightpage.calibration.calibrate import Registered
 from lightpage.calibration.document import Calibration, load_calibration
+from lightpage.calibration.goodness.verdict import Reading
 from lightpage.calibration.parameters import NAMES, PRIORS
 from lightpage.device.profile import load_profile
 from lightpage.errors import CalibrationError, FrameError, LightpageError, RecordingError
+from lightpage.export.commands import calibrate as command
 from lightpage.export.commands.calibrate import calibrate
 from lightpage.progress import reporting
 from lightpage.recording.frame_pair import FramePair
@@ -26,6 +28,10 @@ from lightpage.recording.writer import RecordingWriter
 from lightpage.runtime.recalibration.from_nominal import OtherGraphsWantedError
 from tests.lightpage.small import EXPLAINED, UNEXPLAINED
 from tests.told import Told
+
+NOTHING_READ = Reading(
+    in_sample=False, pages=4, air_bits=0.1, air_standard_error_bits=0.02, light_bits=6.9, user_bytes=0
+)
 
 
 def run(recording: Path, out: Path, *more: str, profile: str = "") -> str:
@@ -132,16 +138,22 @@ def test_what_was_found_is_written_as_json(tmp_path: Path, monkeypatch: pytest.M
     assert (data["pages_used"], data["coherence_before"], data["coherence_after"]) == (2, 0.02, 0.71)
     assert data["parameters"] == calibration.parameters
     assert data["symbols_beside_cameras"] == 0
-    assert data["goodness"] == EXPLAINED.model_dump()
+    assert data["goodness"] == EXPLAINED.model_copy(update={"verdict": "not judged"}).model_dump()
+    assert data["reading"] is None
 
 
 def test_a_wrong_fit_is_an_error_and_is_there_to_be_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fake_registration(monkeypatch, replace(REGISTERED, goodness=UNEXPLAINED))
+
+    def read_nothing(decoder: object, calibration: Calibration, *more: object) -> Calibration:
+        return calibration.judged(NOTHING_READ)
+
+    monkeypatch.setattr(command, "_judged", read_nothing)
     out, picture = tmp_path / "calibration.toml", tmp_path / "left.png"
     asked = flat_recording(tmp_path / "R.h5", 100), out, "--picture", str(picture)
     with pytest.raises(CalibrationError, match="wrong fit"):
         run(*asked)
-    assert load_calibration(out).goodness == UNEXPLAINED
+    assert load_calibration(out).reading == NOTHING_READ
     assert picture.read_bytes().startswith(b"\x89PNG")
     for earlier, said in ((EARLIER, "name another"), (load_profile("bench").to_toml(), "--force")):
         out.write_text(earlier)

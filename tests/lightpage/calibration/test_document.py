@@ -8,6 +8,7 @@ import pytest
 
 from lightpage.calibration.calibrate import KnownPage, Registered, calibrate, check_found
 from lightpage.calibration.document import Calibration, load_calibration, parse_calibration
+from lightpage.calibration.goodness.verdict import Reading
 from lightpage.calibration.known_pages import known_pages
 from lightpage.calibration.parameters import NAMES, PRIORS
 from lightpage.device.profile import load_profile
@@ -24,6 +25,9 @@ from tests.lightpage.uneven import UNEVEN
 
 PROFILE = load_profile("bench")
 HASHES = ("0123456789abcdef" * 4, "f" * 64)
+
+
+READ = Reading(in_sample=False, pages=4, air_bits=6.8, air_standard_error_bits=0.02, light_bits=6.9, user_bytes=3800)
 
 
 @pytest.fixture
@@ -51,6 +55,35 @@ def test_a_calibration_is_read_back_as_it_was_written(calibration: Calibration, 
     assert load_calibration(path) == calibration
     assert load_calibration(path).modulator == UNEVEN
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize(
+    ("reading", "verdict", "lost"),
+    [
+        (READ, "good", 0.1),
+        (READ.model_copy(update={"air_bits": 4.0}), "usable", 2.9),
+        (READ.model_copy(update={"air_bits": 0.2, "user_bytes": 0}), "wrong", 6.7),
+        (READ.model_copy(update={"in_sample": True}), "not judged", 1.2),
+        (READ.model_copy(update={"in_sample": True, "air_bits": 0.2, "user_bytes": 0}), "wrong", 6.7),
+        (None, "not judged", 1.2),
+    ],
+)
+def test_the_verdict_is_what_was_read(
+    calibration: Calibration, reading: Reading | None, verdict: str, lost: float
+) -> None:
+    judged = calibration.judged(reading)
+    assert judged.goodness is not None
+    assert (judged.goodness.verdict, judged.goodness.bits_lost) == (verdict, pytest.approx(lost))
+    assert judged.is_wrong == (verdict == "wrong")
+    assert verdict in judged.verdict_sentence
+    assert parse_calibration(judged.to_toml()) == judged
+
+
+def test_a_profile_with_other_lengths_is_not_good_however_much_is_read(calibration: Calibration) -> None:
+    shorter = calibration.model_copy(update={"parameters": calibration.parameters | {"pipe_length_relative": -0.1}})
+    judged = shorter.judged(READ)
+    assert judged.goodness is not None
+    assert judged.goodness.verdict == "usable"
 
 
 def test_one_from_before_real_lenses_took_them_for_ideal(calibration: Calibration) -> None:

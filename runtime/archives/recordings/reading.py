@@ -1,0 +1,90 @@
+"""Reads known pages with a calibration: the measurement behind its verdict."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lightpage.calibration.goodness.verdict import Reading
+from lightpage.calibration.likelihood.noise import light_bits
+from lightpage.codec.code import Code
+from lightpage.codec.page_codec import PageCodec
+from lightpage.errors import BlackFrameError, InvalidInputError, LostPageError, SaturatedFrameError
+from lightpage.metrics.information import achievable_rate
+from lightpage.page.symbols import symbol_phases
+from lightpage.progress import Progress
+from lightpage.recording.reader import Recording
+from lightpage.runtime.archives.recordings.coded_pages import AIR_LEVELS
+from lightpage.runtime.archives.recordings.evaluation import decode_unseen, pilots_of
+from lightpage.runtime.model.decoding.decoder import Decoder
+from lightpage.runtime.model.decoding.image_tracker import tracker_for
+
+MOST_PAGES = 4
+"""Largest number of pages that are read: their AIR is known to 0.02 bit on the bench device."""
+
+
+def reading_of(
+    decoder: Decoder, recording: Recording, code: Code | None, progress: Progress = lambda step, share: None
+) -> Reading | None:
+    """Read pages of a recording that the fit of a bundle has not seen; its own ones where no others are left.
+
+    Args:
+        decoder: decoder of the bundle, an estimator by the fitted waves.
+        recording: recording of the device.
+        code: code of user bytes; None where no code carries the pages.
+        progress: called with the finished share of the work.
+
+    Returns:
+        What was read; None where no page has known symbols and light.
+    """
+    mask = pilots_of(decoder, recording)
+    rates: list[NDArray[np.float64]] = []
+    in_sample = True
+    for in_sample in (False, True):
+        rates = _rates(decoder, recording, mask, progress, in_sample=in_sample)
+        if rates:
+            break
+    if not rates:
+        return None
+    means = np.array([page.mean() for page in rates])
+    by_symbols = np.sqrt(np.mean([page.var() / page.size for page in rates]) / len(rates))
+    by_pages = means.std(ddof=1) / np.sqrt(len(means)) if len(means) > 1 else 0.0
+    goodness = decoder.bundle.calibration.goodness
+    frames, modulator = (goodness.frame_error_rad, goodness.modulator_error_rad) if goodness else (None, None)
+    information = decoder.graph.value("information")[~mask].astype(np.float64)
+    return Reading(
+        in_sample=in_sample,
+        pages=len(rates),
+        air_bits=float(means.mean()),
+        air_standard_error_bits=float(max(by_symbols, by_pages)),
+        light_bits=light_bits(information, frames or 0.0, modulator or 0.0),
+        user_bytes=0 if code is None else PageCodec(code, mask, decoder.bundle.levels(code.levels)).user_bytes,
+    )
+
+
+def _rates(
+    decoder: Decoder, recording: Recording, mask: NDArray[np.bool_], progress: Progress, *, in_sample: bool
+) -> list[NDArray[np.float64]]:
+    """Contribution of each data symbol to the AIR, bits, of the first pages; a zero for a page that is refused."""
+    tracker = tracker_for(decoder)
+    rates: list[NDArray[np.float64]] = []
+    for number in range(recording.pages):
+        if len(rates) == MOST_PAGES:
+            break
+        symbols = recording.symbols(number)
+        if symbols is None:
+            continue
+        progress("read known pages", len(rates) / MOST_PAGES)
+        frames = recording.frames(number)
+        try:
+            page = decode_unseen(decoder, recording, tracker, mask, frames, symbols, in_sample=in_sample)
+        except (BlackFrameError, SaturatedFrameError):
+            continue
+        except (InvalidInputError, LostPageError):
+            rates.append(np.zeros(1))
+            continue
+        if page is not None:
+            errors = (page.phase - symbol_phases(symbols, decoder.bundle.levels(recording.levels)))[~mask]
+            zeros = np.zeros(errors.shape, np.int64)
+            rates.append(achievable_rate(errors, page.concentration[~mask], zeros, AIR_LEVELS))
+    return rates
