@@ -84,6 +84,16 @@ ORIENTATIONS: Mapping[str, tuple[tuple[int, int], tuple[int, int]]] = {
     "mirrored along the rising diagonal": ((0, -1), (-1, 0)),
 }
 """Orientations in which a camera may show an image, by name: matrices from (x, y) to (column, row)."""
+UPRIGHT: Mapping[str, str] = {
+    "mirrored left to right": "--flip-{0} x",
+    "mirrored top to bottom": "--flip-{0} y",
+    "turned by 180 degrees": "--turn-{0} 180",
+    "turned by 90 degrees to the right": "--turn-{0} 270",
+    "turned by 90 degrees to the left": "--turn-{0} 90",
+    "mirrored along the falling diagonal": "--flip-{0} x --turn-{0} 270",
+    "mirrored along the rising diagonal": "--flip-{0} x --turn-{0} 90",
+}
+"""Options of `lightpage import` that set the frames of a camera upright."""
 _SHOWS = 0.5
 """Share of the patches in the middle that a camera finds which shows the image as it is looked for; another way of
 showing it is looked for where fewer are found."""
@@ -471,7 +481,8 @@ class _Registration:
             CalibrationError: a camera shows the image otherwise and that is not to be taken, or it alone does not
                 show it.
         """
-        told = []
+        told: list[str] = []
+        upright: list[str] = []
         for camera, own in enumerate(found):
             if _significant(own) >= _SHOWS * len(own):
                 continue
@@ -485,9 +496,11 @@ class _Registration:
             self._set_orientation(camera, best)
             if best != AS_IT_IS:
                 told.append(f"{_CAMERAS[camera]} {best}")
+                upright.append(UPRIGHT[best].format(_CAMERAS[camera].removesuffix(" camera")))
         self.orientations = tuple(told)
         if told and not self.any_orientation:
-            wanted = "frames as the profile has them, or --orientation any: set the camera, or turn its frames"
+            options = " ".join(upright)
+            wanted = f"frames as the profile has them (lightpage import {options}), or --orientation any"
             raise CalibrationError("calibration, cameras", " and ".join(told), wanted)
         counts = [_significant(own) for own in found]
         for camera, (mine, other) in enumerate(zip(counts, counts[::-1], strict=True)):

@@ -188,21 +188,26 @@ def test_a_calibration_that_is_stopped_leaves_the_earlier_one_alone(
 
 
 @pytest.mark.parametrize(
-    ("flipped", "named"),
+    ("flipped", "named", "options"),
     [
-        ({"quadrature": -1}, "quadrature camera mirrored left to right"),
-        ({"in_phase": (-2, -1), "quadrature": (-2, -1)}, "in-phase camera turned by 180 degrees and quadrature"),
+        ({"quadrature": -1}, "quadrature camera mirrored left to right", "--flip-quadrature x"),
+        (
+            {"in_phase": (-2, -1), "quadrature": (-2, -1)},
+            "in-phase camera turned by 180 degrees and quadrature",
+            "--turn-in-phase 180 --turn-quadrature 180",
+        ),
     ],
 )
 def test_a_camera_that_is_mounted_otherwise_is_named(
-    flipped: dict[str, Any], named: str, recorded: tuple[Path, str], tmp_path: Path
+    flipped: dict[str, Any], named: str, options: str, recorded: tuple[Path, str], tmp_path: Path
 ) -> None:
     with h5py.File(recorded[0], "r+") as file:
         for name, axes in flipped.items():
             for dataset in (file[f"reference_{name}"], file[name]):
                 dataset[...] = np.flip(dataset[()], axes)
-    with pytest.raises(CalibrationError, match=named):
+    with pytest.raises(CalibrationError, match=named) as refusal:
         run(recorded[0], tmp_path / "C.toml", "--pages", "1")
+    assert f"lightpage import {options})" in str(refusal.value)
     assert not (tmp_path / "C.toml").exists()
 
 

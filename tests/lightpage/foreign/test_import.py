@@ -18,7 +18,7 @@ from click.testing import CliRunner
 from PIL import Image
 from scipy.io import savemat
 
-from lightpage.calibration.calibrate import ORIENTATIONS
+from lightpage.calibration.calibrate import ORIENTATIONS, UPRIGHT
 from lightpage.cli.import_frames import import_frames
 from lightpage.cli.main import lightpage
 from lightpage.errors import BlackFrameError, FrameError, FramesDisagreeError, InvalidInputError, PageError
@@ -32,9 +32,6 @@ from tests.runtime import coded, toy
 
 LEVELS, PAGES = 16, 4
 COUNTS = ("in_phase", "quadrature", "reference_in_phase", "reference_quadrature")
-TURNS = [Upright("", turn) for turn in (180, 270, 90)]
-WAYS = [Upright("x"), Upright("y"), *TURNS, Upright("x", 270), Upright("x", 90)]
-"""Options that docs/guides/your-device.md names, in the order of `ORIENTATIONS`."""
 Arrays = dict[str, np.ndarray]
 
 
@@ -260,8 +257,12 @@ class TestRefused:
                 open_array("p").take(0, 0, 2)
 
 
-@pytest.mark.parametrize(("shown", "upright"), list(zip(list(ORIENTATIONS.values())[1:], WAYS, strict=True)))
-def test_each_way_that_calibrate_finds_is_set_upright(shown: tuple[tuple[int, int], ...], upright: Upright) -> None:
+@pytest.mark.parametrize("name", UPRIGHT)
+def test_each_orientation_that_calibrate_finds_is_set_upright_by_the_options_it_names(name: str) -> None:
+    shown = ORIENTATIONS[name]
+    options = UPRIGHT[name].format("in-phase").split()
+    values = dict(zip(options[::2], options[1::2], strict=True))
+    upright = Upright(values.get("--flip-in-phase", ""), int(values.get("--turn-in-phase", "0")))
     page, seen = np.arange(9).reshape(3, 3), np.zeros((3, 3), int)
     for row, column in np.ndindex(3, 3):
         at = np.array(shown) @ (column - 1, row - 1) + 1
