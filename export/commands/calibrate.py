@@ -10,6 +10,7 @@ from pathlib import Path
 import click
 import numpy as np
 
+from lightpage.calibration.calibrate import OtherFramesError
 from lightpage.calibration.coherence import seen_share
 from lightpage.calibration.document import DEFAULT_PAGES, Calibration, load_calibration
 from lightpage.calibration.goodness.figure import goodness_figure
@@ -104,7 +105,7 @@ def calibrate(
         try:
             calibration = _calibrated(decoder, file, profile, chosen, progress, compute, upright=upright)
         except CalibrationError as error:
-            if decoder is None or graphs is not None:
+            if decoder is None or graphs is not None or isinstance(error, OtherFramesError):
                 raise
             note(f"{error.subject}: {error.got}; once more, with torch")
             decoder = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -98,6 +98,12 @@ _SHOWS = 0.5
 """Share of the patches in the middle that a camera finds which shows the image as it is looked for; another way of
 showing it is looked for where fewer are found."""
 _CAMERAS = ("in-phase camera", "quadrature camera")
+_OTHER_LEVELS = (2, 4, 8, 16, 1 / 2, 1 / 4, 1 / 8, 1 / 16)
+"""Level counts that are tried where known symbols are not found, over the recording's."""
+
+
+class OtherFramesError(CalibrationError):
+    """The frames show something else than they should, which no other way of fitting changes."""
 
 
 @dataclass(frozen=True)
@@ -405,6 +411,19 @@ def _significant(found: Sequence[Measurement]) -> int:
     return sum(each.significance > SIGNIFICANT for each in found)
 
 
+def _other_symbols(pages: Sequence[KnownPage]) -> Iterator[tuple[str, KnownPage]]:
+    """Yield frames with symbols that may be theirs by mistake, with words for that."""
+    first = pages[0]
+    for number, page in enumerate(pages[1:], 1):
+        yield f"the frames of known page {number} show those of page 0", KnownPage(page.pair, first.symbols)
+        yield f"the frames of known page 0 show those of page {number}", KnownPage(first.pair, page.symbols)
+    yield "the frames show the inverse levels, M - 1 - s for s", KnownPage(first.pair, first.symbols.conj())
+    phases = np.mod(np.angle(first.symbols), 2 * np.pi)
+    for factor in _OTHER_LEVELS:
+        levels = f"{factor} times as many levels" if factor > 1 else f"1/{round(1 / factor)} of the levels"
+        yield f"the frames show symbols of {levels} (--levels)", KnownPage(first.pair, np.exp(1j * phases / factor))
+
+
 class _Registration:
     """The state that the stages pass on."""
 
@@ -465,7 +484,28 @@ class _Registration:
         found = self._on_each_camera(stage)
         if stage.middle_only:
             found = self._orient(stage, found)
+            self._check_symbols(stage, found[0] + found[1])
         self._fit(stage, found[0] + found[1])
+
+    def _check_symbols(self, stage: _Stage, found: list[Measurement]) -> None:
+        """Search other symbols than the known ones where these were not found.
+
+        Raises:
+            OtherFramesError: the frames show others.
+        """
+        if _significant(found) >= _FEWEST:
+            return
+        pages = self.pages
+        best, most = "", float(_FEWEST * SIGNIFICANT)
+        for what, page in _other_symbols(pages):
+            self.pages = [page]
+            in_phase, quadrature = self._on_each_camera(stage)
+            clear = sum(each.significance for each in in_phase + quadrature if each.significance > SIGNIFICANT)
+            if clear > most:
+                best, most = what, clear
+        self.pages = pages
+        if best:
+            raise OtherFramesError("calibration, symbols", best, "those that the frames show, page by page")
 
     def _orient(self, stage: _Stage, found: list[list[Measurement]]) -> list[list[Measurement]]:
         """Search the other orientations of a camera that has not found the image in its own.
@@ -478,7 +518,7 @@ class _Registration:
             Measurements of either camera as it shows the image.
 
         Raises:
-            CalibrationError: a camera shows the image otherwise and that is not to be taken, or it alone does not
+            OtherFramesError: a camera shows the image otherwise and that is not to be taken, or it alone does not
                 show it.
         """
         told: list[str] = []
@@ -501,12 +541,12 @@ class _Registration:
         if told and not self.any_orientation:
             options = " ".join(upright)
             wanted = f"frames as the profile has them (lightpage import {options}), or --orientation any"
-            raise CalibrationError("calibration, cameras", " and ".join(told), wanted)
+            raise OtherFramesError("calibration, cameras", " and ".join(told), wanted)
         counts = [_significant(own) for own in found]
         for camera, (mine, other) in enumerate(zip(counts, counts[::-1], strict=True)):
             if other >= _FEWEST and mine < _ALONE * other:
                 got = f"{mine} patches of known symbols where the {_CAMERAS[1 - camera]} has found {other}"
-                raise CalibrationError(f"calibration, {_CAMERAS[camera]}", got, "the same image on both cameras")
+                raise OtherFramesError(f"calibration, {_CAMERAS[camera]}", got, "the same image on both cameras")
         return found
 
     def _set_orientation(self, camera: int, how: str) -> None:

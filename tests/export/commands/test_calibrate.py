@@ -3,6 +3,7 @@
 import json
 import shutil
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -228,3 +229,23 @@ def test_a_device_that_the_shipped_graphs_do_not_allow_for_is_calibrated_with_to
     monkeypatch.setitem(sys.modules, "lightpage.train.trainers.calibration", None)
     with pytest.raises(CalibrationError, match=r"different planes.*torch"):
         run(recording, tmp_path / "D.toml")
+
+
+@pytest.mark.parametrize(
+    ("shown", "named"),
+    [
+        pytest.param(
+            lambda symbols: np.roll(symbols, 1, axis=0),
+            "the frames of known page 0 show those of page 1",
+            marks=pytest.mark.long,
+        ),
+        (lambda symbols: symbols // 4, "1/4 of the levels"),
+    ],
+)
+def test_symbols_that_were_shown_otherwise_are_named(
+    shown: Callable[[np.ndarray], np.ndarray], named: str, recorded: tuple[Path, str], tmp_path: Path
+) -> None:
+    with h5py.File(recorded[0], "r+") as file:
+        file["symbols"][...] = shown(file["symbols"][()])
+    with pytest.raises(CalibrationError, match=named):
+        run(recorded[0], tmp_path / "C.toml")
