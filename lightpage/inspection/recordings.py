@@ -19,6 +19,7 @@ from lightpage.recording import decoded_file, layout, pages
 from lightpage.recording.exposure import check_different, check_pair_light
 from lightpage.recording.hdf5 import find, open_hdf5, read_attribute
 from lightpage.recording.pages import Pages
+from lightpage.recording.pixels.blemishes import Blemishes
 from lightpage.recording.reader import Recording
 from lightpage.recording.stored import ArrayFile
 from lightpage.recording.unfinished import pages_of
@@ -186,6 +187,9 @@ def _exposure(found: Finding, recording: Recording) -> None:
         found.facts[f"{name}: saturated"] = Fact(saturated, f"{saturated:.2%} of the pixels")
         fringes = float(np.mean([contrast(each, reference) for each in own]))
         found.facts[f"{name}: contrast of fringes"] = Fact(fringes, f"{fringes:.2f}")
+    with found.trying("references of a smooth beam"):
+        for name, places in zip(layout.FRAMES, Blemishes.of(pair).places(), strict=True):
+            found.facts[f"{name}: blemishes"] = Fact(places._asdict(), str(places) or "none")
 
 
 def _next(found: Finding, recording: Recording, coded: bool) -> None:

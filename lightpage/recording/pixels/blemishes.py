@@ -8,13 +8,14 @@ is as often bright as dark, and is left as it is.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from lightpage.recording.frame_pair import FramePair
+from lightpage.words import counted
 
 Counts = NDArray[np.integer[Any]]
 Image = NDArray[np.float32]
@@ -50,8 +51,43 @@ _MOST_BRIGHT = 1 / 3
 """Largest number of places that are too bright, over that of places that are too dark, if these are shadows."""
 _MOST_SHADE = 0.2
 """Largest share of all pixels that are in shadows; more belong to the beam."""
+_JOINED_PX = 3
+"""Half of the distance to which shaded pixels belong to one shadow."""
+_NAMED = 3
+"""Places that are named of each kind."""
 _MAD = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
+
+
+class Places(NamedTuple):
+    """Places of a camera's blemishes, (column, row) of pixels.
+
+    Attributes:
+        lost: pixels without a signal.
+        specks: middles of the shadows of dust.
+    """
+
+    lost: list[tuple[int, int]]
+    specks: list[tuple[int, int]]
+
+    @classmethod
+    def of(cls, gains: NDArray[np.uint8]) -> Self:
+        """Find the places of gains [H, W], see `Blemishes`."""
+        lost = [(int(column), int(row)) for row, column in np.argwhere(gains == 0)]
+        shaded = gains > UNIT_GAIN
+        shadows, count = scipy.ndimage.label(scipy.ndimage.binary_dilation(shaded, iterations=_JOINED_PX))
+        middles = scipy.ndimage.center_of_mass(shaded, shadows, range(1, count + 1))
+        return cls(lost, [(round(column), round(row)) for row, column in middles])
+
+    def __str__(self) -> str:
+        """Numbers and first places in words, empty where there are none."""
+        parts = []
+        for places, what in ((self.lost, "hot or dead pixel"), (self.specks, "dust speck")):
+            if places:
+                first = ", ".join(f"({x}, {y})" for x, y in places[:_NAMED])
+                more = ", ..." if len(places) > _NAMED else ""
+                parts.append(f"{counted(len(places), what)} at {first}{more}")
+        return "; ".join(parts)
 
 
 @dataclass(frozen=True)
@@ -93,6 +129,11 @@ class Blemishes:
     def shaded(self) -> tuple[int, int]:
         """Numbers of pixels in shadows, of both cameras."""
         in_phase, quadrature = np.count_nonzero(self.gains > UNIT_GAIN, axis=(1, 2)).tolist()
+        return in_phase, quadrature
+
+    def places(self) -> tuple[Places, Places]:
+        """Return where each camera has its blemishes."""
+        in_phase, quadrature = map(Places.of, self.gains)
         return in_phase, quadrature
 
     def corrected(self, pair: FramePair) -> FramePair:

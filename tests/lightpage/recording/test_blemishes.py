@@ -89,3 +89,18 @@ def test_the_graph_takes_off_what_is_mended_beforehand() -> None:
     in_graph = brightness(pair, blemishes.gains)
     assert np.sqrt(np.mean((in_graph - mended) ** 2)) < 2e-3  # a mended count is rounded
     assert np.abs(brightness(pair, None) - mended).max() > 0.1
+
+
+def test_places_of_blemishes_are_named() -> None:
+    reference = np.random.default_rng(0).poisson(100, (200, 300)).astype(np.uint8)
+    for column, row in ((40, 30), (250, 160)):
+        reference[row, column] = 255
+    row, column = np.indices(reference.shape)
+    shadow = 1 - 0.6 * np.exp(-((column - 150) ** 2 + (row - 100) ** 2) / (2 * 3**2))
+    clean = np.full(reference.shape, 100, np.uint8)
+    in_phase, quadrature = Blemishes.of(FramePair(np.rint(reference * shadow).astype(np.uint8), clean)).places()
+    assert in_phase.lost == [(40, 30), (250, 160)]
+    ((x, y),) = in_phase.specks
+    assert (x, y) == (pytest.approx(150, abs=1), pytest.approx(100, abs=1))
+    assert "2 hot or dead pixels at (40, 30)" in str(in_phase)
+    assert not str(quadrature)
