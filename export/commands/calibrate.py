@@ -16,6 +16,8 @@ from lightpage.calibration.document import DEFAULT_PAGES, Calibration, load_cali
 from lightpage.calibration.goodness.figure import goodness_figure
 from lightpage.calibration.interfaces import Twin
 from lightpage.calibration.known_pages import first_lit_pages
+from lightpage.calibration.parameters import NAMES, PRIORS, indices
+from lightpage.calibration.waves.wave_model import axial_place_m
 from lightpage.cli.main import missing
 from lightpage.cli.options import JSON, named_profile, new_file, profile_option
 from lightpage.cli.paths import NewPath, OutputFile
@@ -249,6 +251,10 @@ def figures(calibration: Calibration, profile: Profile, seconds: float, lost: in
         "turn_deg": float(np.rad2deg(calibration.turn_rad)),
         "turn_deviation_deg": calibration.turn_deviation_rad and math.degrees(calibration.turn_deviation_rad),
         "parameters": calibration.parameters,
+        "axial_mm": {
+            name.removesuffix("_axial_rad"): 1e3 * axial_place_m(calibration.parameters[name], profile)
+            for name in _AXIAL
+        },
         "modulation": calibration.modulation,
         "symbols_beside_cameras": lost,
         "goodness": None if calibration.goodness is None else calibration.goodness.model_dump(),
@@ -257,6 +263,7 @@ def figures(calibration: Calibration, profile: Profile, seconds: float, lost: in
     }
 
 
+_AXIAL = tuple(NAMES[index] for index in indices("axial"))
 _UNITS = frozenset({"m", "rad", "px", "deg", "relative"})
 
 
@@ -267,21 +274,24 @@ def _label(name: str) -> str:
 
 
 def table(calibration: Calibration, profile: Profile) -> str:
-    """Fitted values with their standard deviations beside the nominal ones, for people."""
+    """Fitted values with standard deviations, beside nominal ones and usual differences from these, for people."""
     shown = {
         "pipe_angle_rad": ("pipe angle, degree", profile.pipe.angle_deg, 180 / np.pi),
         "focal_length_relative": ("focal length, mm", 1e3 * profile.lens.focal_length_m, None),
         "pipe_length_relative": ("pipe length, mm", 1e3 * profile.pipe.length_m, None),
         "pipe_width_relative": ("pipe width, mm", 1e3 * profile.pipe.width_m, None),
     }
-    lines = [f"{'':<32}{'fitted':>12}   {'+-':<10}{'nominal':>10}"]
+    lines = [f"{'':<32}{'fitted':>12}   {'+-':<10}{'nominal':>10}   {'usual +-':<10}"]
     for name, value in calibration.parameters.items():
         if name not in calibration.fitted:
             continue
         label, nominal, unit = shown.get(name, (_label(name), 0.0, 1.0))
         factor = nominal if unit is None else unit
         fitted, deviation = nominal + factor * value, factor * calibration.deviations[name]
-        lines.append(f"{label:<32}{fitted:>12.6g}   {deviation:<10.2g}{nominal:>10.6g}")
+        usual = factor * PRIORS[NAMES.index(name)]
+        line = f"{label:<32}{fitted:>12.6g}   {deviation:<10.2g}{nominal:>10.6g}   {usual:<10.2g}"
+        axial = f"{1e3 * axial_place_m(value, profile):+.3g} mm from its focal plane" if name in _AXIAL else ""
+        lines.append(f"{line}{axial}".rstrip())
     for name, value in calibration.modulation.items():
         lines.append(f"{_label(name):<32}{value:>12.6g}   {calibration.modulation_deviations[name]:<10.2g}{0:>10.6g}")
     turn, known = math.degrees(calibration.turn_rad), calibration.turn_deviation_rad

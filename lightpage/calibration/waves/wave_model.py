@@ -62,6 +62,15 @@ def defocus(axial_rad: Any, width_m: Any) -> Any:
     return axial_rad * (2 / width_m) ** 2
 
 
+def axial_place_m(axial_rad: float, profile: Profile) -> float:
+    """Distance of a plane from the focal plane, metres, whose defocus is a phase at the facet's wall.
+
+    The phase of a distance d at height R of the facet is pi d R^2 / (wavelength f^2).
+    """
+    factor = defocus(axial_rad, profile.pipe.width_m)
+    return float(factor * profile.light.wavelength_m * profile.lens.focal_length_m**2 / np.pi)
+
+
 def axial_of_cameras(value: Mapping[str, Any]) -> tuple[Any, Any]:
     """Axial place of both cameras on average, and half of what in-phase lies beyond quadrature; radians at the wall."""
     one, other = value["in_phase_axial_rad"], value["quadrature_axial_rad"]

@@ -139,6 +139,11 @@ def test_what_was_found_is_written_as_json(tmp_path: Path, monkeypatch: pytest.M
     assert (data["pages_used"], data["coherence_before"], data["coherence_after"]) == (2, 0.02, 0.71)
     assert data["parameters"] == calibration.parameters
     assert data["symbols_beside_cameras"] == 0
+    profile = load_profile("bench")
+    wall_m = profile.pipe.width_m / 2
+    phase = np.pi * data["axial_mm"]["modulator"] / 1e3 * wall_m**2
+    phase /= profile.light.wavelength_m * profile.lens.focal_length_m**2
+    assert phase == pytest.approx(calibration.parameters["modulator_axial_rad"])
     assert data["goodness"] == EXPLAINED.model_copy(update={"verdict": "not judged"}).model_dump()
     assert data["reading"] is None
 
