@@ -17,19 +17,27 @@ Real = NDArray[np.float64]
 class CameraView:
     """The frames of both cameras, and where the symbols' own images lie on them.
 
-    A symbol counts as shown where the middle of its image lies on both frames. Decoders are trained on whole images:
-    they claim a symbol of which half is missing as if it were there, and are wrong in one of ten.
+    A symbol counts as shown where the middle of its image lies on both frames. Networks are trained on whole images:
+    they claim a symbol of which half is missing as if it were there, and are wrong in one of ten. An estimator knows
+    how much of each symbol's light the cameras measure where the calibration saw the image. There, all symbols count
+    as shown, and elsewhere those too that the calibration saw beside a camera.
 
     Args:
         profile: the nominal device.
         registration: registration of the model, [2, 2, 10]; None where it is unknown, and all symbols count as shown.
         places: along every branch, the direct one first, grid samples (column, row) [B, 2, ny, nx]; None as above.
+        measured: whether concentrations follow from the light that the cameras measure of each symbol.
     """
 
     def __init__(
-        self, profile: Profile, registration: NDArray[np.float32] | None, places: NDArray[np.float32] | None
+        self,
+        profile: Profile,
+        registration: NDArray[np.float32] | None,
+        places: NDArray[np.float32] | None,
+        *,
+        measured: bool = False,
     ) -> None:
-        self._profile, self._registration = profile, registration
+        self._profile, self._registration, self._measured = profile, registration, measured
         self._places = None if places is None else places[0].astype(np.float64)
 
     def seen(self, inference: Inference, registration: NDArray[np.float32] | None = None) -> Inference:
@@ -43,7 +51,10 @@ class CameraView:
         if self._places is None or registration is None or self._shown(registration, self._rim).all():
             return inference
         whole = _terms(self._profile, self._places)
-        return replace(inference, concentration=inference.concentration * self._shown(registration, whole))
+        shown = self._shown(registration, whole)
+        if self._measured and self._registration is not None:
+            shown = shown | ~self._shown(self._registration, whole)
+        return replace(inference, concentration=inference.concentration * shown)
 
     @cached_property
     def _rim(self) -> Real:

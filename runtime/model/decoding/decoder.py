@@ -256,7 +256,7 @@ class Decoder:
         """Says which symbols the cameras show."""
         ports, told = self.graph.ports, ("registration", "places")
         values = [self.graph.value(name) for name in told] if ports.keys() >= set(told) else None
-        return CameraView(self.bundle.profile, *(values or (None, None)))
+        return CameraView(self.bundle.profile, *(values or (None, None)), measured=self._estimates)
 
     @cached_property
     def phase_refit(self) -> PhaseRefit:

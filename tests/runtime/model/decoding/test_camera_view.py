@@ -45,6 +45,19 @@ def test_columns_that_leave_one_camera_are_not_claimed(camera: int) -> None:
     assert CameraView(BENCH, None, None).seen(said, moved) is said
 
 
+def test_an_estimator_keeps_columns_that_the_calibration_saw_beside_a_camera() -> None:
+    shape, (registration, places) = BENCH.page_shape, nominal(BENCH)
+    calibrated = shifted(registration, np.array([100.0, 0.0]))
+    view = CameraView(BENCH, calibrated.astype(np.float32), places, measured=True)
+    said = Inference(np.ones((2, *shape), np.float32), np.zeros(shape, np.float32), np.full(shape, 9, np.float32))
+    np.testing.assert_array_equal(view.seen(said).concentration, said.concentration)
+    further = shifted(registration, np.array([130.0, 0.0])).astype(np.float32)
+    lost = np.count_nonzero(view.seen(said, further).concentration[0] == 0)
+    of_network = CameraView(BENCH, calibrated.astype(np.float32), places)
+    both = np.count_nonzero(of_network.seen(said, further).concentration[0] == 0)
+    assert 0 < lost < both
+
+
 def test_no_decode_and_no_tracker_counts_pilots_that_a_camera_does_not_show(decoder: Decoder) -> None:
     blind, (registration, places) = decoder.with_table({}), nominal(WIDE)
     moved = shifted(registration, np.array([BENCH.frame_shape[1] / 2 - 100, 0.0]))
