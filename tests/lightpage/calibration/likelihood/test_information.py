@@ -1,0 +1,28 @@
+"""Information of symbols is smooth over the page, but for symbols whose light lies beside a camera."""
+
+import numpy as np
+import pytest
+
+from lightpage.calibration.likelihood.information import _smoothed
+
+SHAPE = (56, 87)
+SPREAD = 0.15
+
+
+def measured(seed: int = 0) -> np.ndarray:
+    return np.asarray(np.random.default_rng(seed).normal(1, SPREAD, SHAPE))
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_symbols_beside_a_camera_keep_their_information_and_do_not_lower_that_of_others(axis: int) -> None:
+    information = measured()
+    corner = np.moveaxis(information, axis, 0)
+    corner[-1, -9:] = 0.05
+    smoothed = np.moveaxis(_smoothed(information), axis, 0)
+    np.testing.assert_allclose(smoothed[-1, -9:], 0.05)
+    np.testing.assert_allclose(smoothed[-2, -8:], 1, atol=0.3)
+    assert np.mean(smoothed[-2, -8:]) == pytest.approx(1, abs=0.1)
+
+
+def test_what_varies_with_the_page_is_smoothed() -> None:
+    assert np.std(_smoothed(measured())) < SPREAD / 3
