@@ -19,8 +19,11 @@ _PROBES = 4
 _SMOOTHED = 1.5
 """Standard deviation, symbols, of the filter of the information, which varies slowly except at the walls' shadows."""
 _DARK = 0.6
-"""Information, over the median about a symbol, below which its light lies beside a camera. Its own information then
-stays as it is. That of other symbols varies by 0.18 on one page, with the light of the others."""
+"""Information, over the median about a symbol, below which its light lies beside a camera, and is not smoothed. That of
+other symbols varies by 0.18 on one page, with the light of the others."""
+_DAMPING = 2.0
+"""Factor on the information of such symbols. They share what little of their light the cameras measure, and steps by
+their own information alone would overshoot together, and swing."""
 _MEDIAN = 5
 """Side of the median filters, symbols."""
 _SOLVER_ROUNDS = 5
@@ -77,11 +80,11 @@ def measured_information(fit: KnownPageFit, progress: ProgressCallback = lambda 
 
 
 def _smoothed(information: Real) -> Real:
-    """Smooth information [ny, nx] but that of symbols whose light lies beside a camera."""
+    """Smooth information [ny, nx] but that of symbols whose light lies beside a camera, which is damped."""
     dark = information < _DARK * scipy.ndimage.median_filter(information, _MEDIAN)
     total = scipy.ndimage.gaussian_filter(np.where(dark, 0, information), _SMOOTHED)
     weight = scipy.ndimage.gaussian_filter((~dark).astype(np.float64), _SMOOTHED)
-    return np.where(dark, information, total / np.maximum(weight, _TINY))
+    return np.where(dark, _DAMPING * information, total / np.maximum(weight, _TINY))
 
 
 def _responses(fit: KnownPageFit, information: Real, couplings: Real) -> Real:
