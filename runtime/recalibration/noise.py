@@ -37,6 +37,8 @@ MOST_STEPS = 6
 """Largest number of Gauss-Newton steps."""
 _LEAST_GAIN_BITS = 0.004
 """Least gain of information for another step, for a flat field, and for the estimation of deviations, bits a symbol."""
+_PATIENCE = 2
+"""Number of steps that gain no information together after which no more are made. One alone may gain little."""
 _DAMPING = 0.2
 """Precision that damped steps of tilt and shift get beside their own, over what the phases take up of it."""
 _LEAST_DIFFERENCE_RAD = 0.01
@@ -233,7 +235,7 @@ class _KnownPages:
         Args:
             precision: inverse variance of the modulator's deviations.
             most: largest number of steps.
-            until_no_gain: whether steps end where they gain no information.
+            until_no_gain: whether steps end where the next ones gain no information.
         """
         graph = self._graph.with_table({DEVIATION_PRECISION: precision})
         states = [graph.first_estimate(feeds) for feeds in self._feeds]
@@ -245,10 +247,12 @@ class _KnownPages:
             flat, by_others = self._flat_field(errors)
             noise = errors.noise(by_others, self._data)
             step = _Step(errors, flat, by_others, noise, errors.bits(noise, self._data))
-            if until_no_gain and number > 1 and step.bits < steps[-1].bits + _LEAST_GAIN_BITS:
-                break
             steps.append(step)
+            if until_no_gain and number > _PATIENCE and step.bits < steps[-1 - _PATIENCE].bits + _LEAST_GAIN_BITS:
+                break
             states = [{**state, "p": _with_noise(state["p"], noise)} for state in states]
+        while until_no_gain and len(steps) > 2 and steps[-1].bits < steps[-2].bits + _LEAST_GAIN_BITS:
+            steps.pop()
         last = steps[-1]
         rows = [*(step.errors.noise(last.by_others, self._data) for step in steps[:-1]), last.noise]
         variance = float(np.median(last.noise[0] / last.errors.information[:, self._data] + last.noise[1]))
