@@ -18,9 +18,13 @@ _PROBES = 4
 """Random directions for each page in which the curvature is probed."""
 _SMOOTHED = 1.5
 """Standard deviation, symbols, of the filter of the information, which varies slowly except at the walls' shadows."""
-_DARK = 0.6
-"""Information, over the median about a symbol, below which its light lies beside a camera, and is not smoothed. That of
-other symbols varies by 0.18 on one page, with the light of the others."""
+_DEVIATIONS = 4.0
+"""Standard deviations below the median about a symbol from which on its light lies beside a camera, and its information
+is not smoothed. That of other symbols varies with the light of the others, on a page of the bench device by 0.18."""
+_MOST_SPREAD = 0.2
+"""Largest standard deviation of the information about its median with which such symbols are told from chance."""
+_MAD = 1.4826
+"""Standard deviation of a normal distribution over its median absolute deviation."""
 _DAMPING = 2.0
 """Factor on the information of such symbols. They share what little of their light the cameras measure, and steps by
 their own information alone would overshoot together, and swing."""
@@ -81,7 +85,10 @@ def measured_information(fit: KnownPageFit, progress: ProgressCallback = lambda 
 
 def _smoothed(information: Real) -> Real:
     """Smooth information [ny, nx] but that of symbols whose light lies beside a camera, which is damped."""
-    dark = information < _DARK * scipy.ndimage.median_filter(information, _MEDIAN)
+    usual = scipy.ndimage.median_filter(information, _MEDIAN)
+    relative = information / np.where(usual > 0, usual, 1)
+    spread = _MAD * float(np.median(np.abs(relative - np.median(relative))))
+    dark = (relative < 1 - _DEVIATIONS * spread) & (spread <= _MOST_SPREAD)
     total = scipy.ndimage.gaussian_filter(np.where(dark, 0, information), _SMOOTHED)
     weight = scipy.ndimage.gaussian_filter((~dark).astype(np.float64), _SMOOTHED)
     return np.where(dark, _DAMPING * information, total / np.maximum(weight, _TINY))

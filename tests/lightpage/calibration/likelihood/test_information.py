@@ -24,5 +24,7 @@ def test_symbols_beside_a_camera_do_not_lower_the_information_of_others_nor_take
     assert np.mean(smoothed[-2, -8:]) == pytest.approx(1, abs=0.1)
 
 
-def test_what_varies_with_the_page_is_smoothed() -> None:
-    assert np.std(_smoothed(measured())) < SPREAD / 3
+@pytest.mark.parametrize("spread", [SPREAD, 0.5])
+def test_what_varies_with_the_page_is_smoothed(spread: float) -> None:
+    information = np.random.default_rng(0).normal(1, spread, SHAPE)
+    assert np.std(_smoothed(information)) < spread / 3
