@@ -125,7 +125,7 @@ def calibrate(
             written = Path(folder) / (_BUNDLE if bundle is None else bundle.name)
             read = bundle is not None or (file.pages > len(chosen) and calibration.statistics is not None)
             try:
-                judged = _judged(decoder, calibration, file, profile, written if read else None, progress)
+                judged = judged_by_reading(decoder, calibration, file, profile, written if read else None, progress)
             except LightpageError as error:
                 if bundle is not None:
                     calibration.save(out)
@@ -186,7 +186,7 @@ def _calibrated(
     return calibrate_recording(recording, profile, pages, progress, any_orientation=not upright, compute=device)
 
 
-def _judged(
+def judged_by_reading(
     decoder: Decoder | None,
     calibration: Calibration,
     recording: Recording,

@@ -154,7 +154,7 @@ def test_a_wrong_fit_is_an_error_and_is_there_to_be_looked_at(tmp_path: Path, mo
     def read_nothing(decoder: object, calibration: Calibration, *more: object) -> Calibration:
         return calibration.judged(NOTHING_READ)
 
-    monkeypatch.setattr(command, "_judged", read_nothing)
+    monkeypatch.setattr(command, "judged_by_reading", read_nothing)
     out, picture = tmp_path / "calibration.toml", tmp_path / "left.png"
     asked = flat_recording(tmp_path / "R.h5", 100), out, "--picture", str(picture)
     with pytest.raises(CalibrationError, match="wrong fit"):

@@ -102,5 +102,5 @@ def test_places_of_blemishes_are_named() -> None:
     assert in_phase.lost == [(40, 30), (250, 160)]
     ((x, y),) = in_phase.specks
     assert (x, y) == (pytest.approx(150, abs=1), pytest.approx(100, abs=1))
-    assert "2 hot or dead pixels at (40, 30)" in str(in_phase)
+    assert all(place in str(in_phase) for place in ("(40, 30)", "(250, 160)"))
     assert not str(quadrature)
