@@ -411,6 +411,27 @@ def _significant(found: Sequence[Measurement]) -> int:
     return sum(each.significance > SIGNIFICANT for each in found)
 
 
+def _check_symbols(work: _Registration, stage: _Stage, found: list[Measurement]) -> None:
+    """Search other symbols than the known ones where these were not found.
+
+    Raises:
+        OtherFramesError: the frames show others.
+    """
+    if _significant(found) >= _FEWEST:
+        return
+    pages = work.pages
+    best, most = "", float(_FEWEST * SIGNIFICANT)
+    for what, page in _other_symbols(pages):
+        work.pages = [page]
+        in_phase, quadrature = work.on_each_camera(stage)
+        clear = sum(each.significance for each in in_phase + quadrature if each.significance > SIGNIFICANT)
+        if clear > most:
+            best, most = what, clear
+    work.pages = pages
+    if best:
+        raise OtherFramesError("calibration, symbols", best, "those that the frames show, page by page")
+
+
 def _other_symbols(pages: Sequence[KnownPage]) -> Iterator[tuple[str, KnownPage]]:
     """Yield frames with symbols that may be theirs by mistake, with words for that."""
     first = pages[0]
@@ -481,31 +502,11 @@ class _Registration:
     def single_camera(self, stage: _Stage) -> None:
         """Measure the direct branch on each camera by itself and fit places and slopes."""
         self.begin(stage.name)
-        found = self._on_each_camera(stage)
+        found = self.on_each_camera(stage)
         if stage.middle_only:
             found = self._orient(stage, found)
-            self._check_symbols(stage, found[0] + found[1])
+            _check_symbols(self, stage, found[0] + found[1])
         self._fit(stage, found[0] + found[1])
-
-    def _check_symbols(self, stage: _Stage, found: list[Measurement]) -> None:
-        """Search other symbols than the known ones where these were not found.
-
-        Raises:
-            OtherFramesError: the frames show others.
-        """
-        if _significant(found) >= _FEWEST:
-            return
-        pages = self.pages
-        best, most = "", float(_FEWEST * SIGNIFICANT)
-        for what, page in _other_symbols(pages):
-            self.pages = [page]
-            in_phase, quadrature = self._on_each_camera(stage)
-            clear = sum(each.significance for each in in_phase + quadrature if each.significance > SIGNIFICANT)
-            if clear > most:
-                best, most = what, clear
-        self.pages = pages
-        if best:
-            raise OtherFramesError("calibration, symbols", best, "those that the frames show, page by page")
 
     def _orient(self, stage: _Stage, found: list[list[Measurement]]) -> list[list[Measurement]]:
         """Search the other orientations of a camera that has not found the image in its own.
@@ -570,7 +571,7 @@ class _Registration:
         stage = _Stage("angle between the arms", 0, 1, (), COHERENT_BRANCHES)
         self.begin(stage.name)
         total = 0j
-        for one, other in zip(*self._on_each_camera(stage), strict=True):
+        for one, other in zip(*self.on_each_camera(stage), strict=True):
             if min(one.significance, other.significance) > SIGNIFICANT:
                 weight = 1 / (1 / one.significance + 1 / other.significance)
                 total += weight * np.exp(1j * (one.phase - other.phase))
@@ -692,7 +693,7 @@ class _Registration:
             return self.patches[:: math.ceil(len(self.patches) / (stage.most_patches or len(self.patches)))]
         return middle_patches(self.profile, self.patches, _FEWEST)
 
-    def _on_each_camera(self, stage: _Stage) -> list[list[Measurement]]:
+    def on_each_camera(self, stage: _Stage) -> list[list[Measurement]]:
         """The first page's patches as either camera sees them by itself."""
         return self._measure(stage, {(camera,): one for camera, one in enumerate(self._frame_samplers(self.pages[0]))})
 

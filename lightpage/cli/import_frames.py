@@ -25,14 +25,12 @@ from lightpage.files import read_text, write_json
 from lightpage.foreign.array import ForeignArray
 from lightpage.foreign.frames import Arrangement, Flip, Frames, Turn, Upright, both_cameras, one_camera
 from lightpage.foreign.frames import Pages as ForeignPages
-from lightpage.foreign.import_job import Material, describe, exposure_of, references_of, tell, write
+from lightpage.foreign.import_job import Material, blemishes_of, describe, exposure_of, references_of, tell, write
 from lightpage.foreign.opening import open_array
 from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
-from lightpage.progress import note, warn
-from lightpage.recording.layout import FRAMES, MAX_BIT_DEPTH, MIN_BIT_DEPTH
+from lightpage.progress import warn
+from lightpage.recording.layout import MAX_BIT_DEPTH, MIN_BIT_DEPTH
 from lightpage.recording.pages import Pages
-from lightpage.recording.pixels.blemishes import Blemishes
-from lightpage.recording.reader import Recording
 from lightpage.recording.unfinished import claim, drop_claim
 from lightpage.recording.writer import RecordingWriter
 
@@ -137,11 +135,7 @@ def import_frames(out: Path, force: bool, keep_unlit: bool, json_path: Path | No
     drop_claim(out)
     if unlit:
         warn(describe(unlit))
-    with Recording.open(out) as recording:
-        blemishes = dict(zip(FRAMES, Blemishes.of(recording.references()).places(), strict=True))
-    for camera, places in blemishes.items():
-        if str(places):
-            note(f"{camera.replace('_', '-')} camera: {places}; calibration corrects them")
+    blemishes = blemishes_of(out)
     figures = {
         "pages": material.pages,
         "frame_shape": list(material.profile.frame_shape),
@@ -150,7 +144,7 @@ def import_frames(out: Path, force: bool, keep_unlit: bool, json_path: Path | No
         "black_level": material.black_level,
         **asdict(exposure),
         "unlit": [asdict(each) for each in unlit],
-        "blemishes": {camera: places._asdict() for camera, places in blemishes.items()},
+        "blemishes": blemishes,
     }
     write_json(json_path, figures)
     click.echo(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +25,10 @@ from lightpage.page.symbols import check_symbols
 from lightpage.progress import note, track, warn
 from lightpage.recording.exposure import check_different, check_light, unused_low_bits
 from lightpage.recording.frame_pair import FramePair
-from lightpage.recording.layout import MAX_BIT_DEPTH
+from lightpage.recording.layout import FRAMES, MAX_BIT_DEPTH
 from lightpage.recording.pixels.black_level import without_black
+from lightpage.recording.pixels.blemishes import Blemishes
+from lightpage.recording.reader import Recording
 from lightpage.recording.writer import RecordingWriter
 from lightpage.words import counted
 
@@ -234,6 +237,16 @@ def references_of(material: Material, exposure: Exposure) -> FramePair:
         check_light(f"{frames.subject}: {name} reference frame", counts, exposure.bit_depth)
         pair.append(mean)
     return FramePair(*pair)
+
+
+def blemishes_of(path: Path) -> dict[str, dict[str, list[tuple[int, int]]]]:
+    """Return the places of blemishes on a recording's references by camera, and tell whoever watches of them."""
+    with Recording.open(path) as recording:
+        found = dict(zip(FRAMES, Blemishes.of(recording.references()).places(), strict=True))
+    for camera, places in found.items():
+        if str(places):
+            note(f"{camera.replace('_', '-')} camera: {places}; calibration corrects them")
+    return {camera: places._asdict() for camera, places in found.items()}
 
 
 def write(material: Material, exposure: Exposure, writer: RecordingWriter, *, keep_unlit: bool) -> list[Unlit]:

@@ -324,7 +324,7 @@ def test_an_interrupted_export_leaves_nothing_and_the_next_one_works(
 
     files = dict(made.files)
     with Recording.open(small_device[3]) as recording:
-        monkeypatch.setattr(proof, "with_code", interrupt)
+        monkeypatch.setattr(proof, "judged_manifest", interrupt)
         with pytest.raises(KeyboardInterrupt):
             proof.proven(tmp_path / "B.zip", made.manifest, files, recording.path, lambda what, share: None)
         assert not list(tmp_path.iterdir())
