@@ -75,14 +75,16 @@ def table(calibration: Calibration, profile: Profile) -> str:
             continue
         label, nominal, unit = shown.get(name, (_label(name), 0.0, 1.0))
         factor = nominal if unit is None else unit
-        fitted, deviation = nominal + factor * value, factor * calibration.deviations[name]
+        fitted = nominal + factor * value
+        deviation = factor * calibration.deviations[name]
         usual = factor * PRIORS[NAMES.index(name)]
         line = f"{label:<32}{fitted:>12.6g}   {deviation:<10.2g}{nominal:>10.6g}   {usual:<10.2g}"
         axial = f"{1e3 * axial_place_m(value, profile):+.3g} mm from its focal plane" if name in _AXIAL else ""
         lines.append(f"{line}{axial}".rstrip())
     for name, value in calibration.modulation.items():
         lines.append(f"{_label(name):<32}{value:>12.6g}   {calibration.modulation_deviations[name]:<10.2g}{0:>10.6g}")
-    turn, known = math.degrees(calibration.turn_rad), calibration.turn_deviation_rad
-    told = "" if known is None else f"{math.degrees(known):.2g}"
-    lines.append(f"{'between the arms, degree':<32}{turn:>12.6g}   {told:<10}{'+90 or -90':>10}")
+    turn = math.degrees(calibration.turn_rad)
+    deviation_rad = calibration.turn_deviation_rad
+    turn_deviation = "" if deviation_rad is None else f"{math.degrees(deviation_rad):.2g}"
+    lines.append(f"{'between the arms, degree':<32}{turn:>12.6g}   {turn_deviation:<10}{'+90 or -90':>10}")
     return "\n".join(lines)

@@ -420,13 +420,15 @@ def _check_symbols(work: _Registration, stage: _Stage, found: list[Measurement])
     if _significant(found) >= _FEWEST:
         return
     pages = work.pages
-    best, most = "", float(_FEWEST * SIGNIFICANT)
+    best = ""
+    most = float(_FEWEST * SIGNIFICANT)
     for what, page in _other_symbols(pages):
         work.pages = [page]
         in_phase, quadrature = work.on_each_camera(stage)
         clear = sum(each.significance for each in in_phase + quadrature if each.significance > SIGNIFICANT)
         if clear > most:
-            best, most = what, clear
+            best = what
+            most = clear
     work.pages = pages
     if best:
         raise OtherFramesError("calibration, symbols", best, "those that the frames show, page by page")

@@ -248,25 +248,25 @@ class Calibration(TomlTable):
         Args:
             reading: what was read of them; None where no page was read, which leaves the fit not judged.
         """
-        found = self.goodness
-        if found is None:
+        goodness = self.goodness
+        if goodness is None:
             return self
         verdict = NOT_JUDGED if reading is None else reading.verdict
         if reading is None or verdict == NOT_JUDGED:
-            judged = found.model_copy(update={"verdict": verdict})
+            judged = goodness.model_copy(update={"verdict": verdict})
             return self.model_copy(update={"goodness": judged, "reading": reading})
         lost = max(0.0, reading.light_bits - reading.air_bits)
         other_profile = unlike_profile(self.vector)
         if verdict == "good" and other_profile:
             verdict = "usable"
-        cause = other_profile if verdict == "good" else found.cause
-        judged = found.model_copy(update={"verdict": verdict, "bits_lost": lost, "cause": cause})
+        cause = other_profile if verdict == "good" else goodness.cause
+        judged = goodness.model_copy(update={"verdict": verdict, "bits_lost": lost, "cause": cause})
         return self.model_copy(update={"goodness": judged, "reading": reading})
 
     def contradicted(self, cause: str) -> Self:
         """The calibration as a wrong one, for a cause in words."""
-        found = self.goodness
-        wrong = None if found is None else found.model_copy(update={"verdict": "wrong", "cause": cause})
+        goodness = self.goodness
+        wrong = None if goodness is None else goodness.model_copy(update={"verdict": "wrong", "cause": cause})
         return self.model_copy(update={"goodness": wrong, "reading": None})
 
     @property
@@ -294,18 +294,19 @@ class Calibration(TomlTable):
         Raises:
             CalibrationError: it is wrong.
         """
-        found, read = self.goodness, self.reading
-        if found is None or found.verdict == "good":
+        goodness = self.goodness
+        reading = self.reading
+        if goodness is None or goodness.verdict == "good":
             return
-        if found.verdict == NOT_JUDGED:
-            if found.bits_lost >= GOOD:
-                warn(f"{subject}: about {found.bits_lost:.2f} bit a symbol may be lost: {found.cause}")
+        if goodness.verdict == NOT_JUDGED:
+            if goodness.bits_lost >= GOOD:
+                warn(f"{subject}: about {goodness.bits_lost:.2f} bit a symbol may be lost: {goodness.cause}")
             return
-        cause = f": {found.cause}" if found.cause else ""
-        lost = f"which costs about {found.bits_lost:.2f} bit a symbol" if read is None else str(read)
-        got = f"a {found.verdict} fit, {lost}{cause}"
-        if found.verdict == "wrong":
-            expected = f"at most {USABLE:g} bit" if read is None else "pages that some code carries"
+        cause = f": {goodness.cause}" if goodness.cause else ""
+        lost = f"which costs about {goodness.bits_lost:.2f} bit a symbol" if reading is None else str(reading)
+        got = f"a {goodness.verdict} fit, {lost}{cause}"
+        if goodness.verdict == "wrong":
+            expected = f"at most {USABLE:g} bit" if reading is None else "pages that some code carries"
             raise CalibrationError(subject, got, f"{expected}{remedy}")
         warn(f"{subject}: {got}")
 

@@ -242,11 +242,11 @@ def references_of(material: Material, exposure: Exposure) -> FramePair:
 def blemishes_of(path: Path) -> dict[str, dict[str, list[tuple[int, int]]]]:
     """Return the places of blemishes on a recording's references by camera, and tell whoever watches of them."""
     with Recording.open(path) as recording:
-        found = dict(zip(FRAMES, Blemishes.of(recording.references()).places(), strict=True))
-    for camera, places in found.items():
+        by_camera = dict(zip(FRAMES, Blemishes.of(recording.references()).places(), strict=True))
+    for camera, places in by_camera.items():
         if str(places):
             note(f"{camera.replace('_', '-')} camera: {places}; calibration corrects them")
-    return {camera: places._asdict() for camera, places in found.items()}
+    return {camera: places._asdict() for camera, places in by_camera.items()}
 
 
 def write(material: Material, exposure: Exposure, writer: RecordingWriter, *, keep_unlit: bool) -> list[Unlit]:

@@ -42,7 +42,7 @@ class Reading(TomlTable):
     user_bytes: Annotated[int, Field(ge=0)]
 
     def __str__(self) -> str:
-        """What was read, in words."""
+        """Sentence that states the reading."""
         return (
             f"{counted(self.pages, 'page')} that the fit has {'' if self.in_sample else 'not '}seen: "
             f"{self.air_bits:.3f} +- {self.air_standard_error_bits:.3f} bits a symbol read, {self.share:.2f} of the "

@@ -63,7 +63,8 @@ def light_bits(information: Real, frame_error_rad: float, modulator_error_rad: f
         information: Fisher information of each symbol's phase.
         frame_error_rad, modulator_error_rad: standard deviations of a symbol's phase by either noise.
     """
-    frames, modulator = frame_error_rad**2, modulator_error_rad**2
+    frames = frame_error_rad**2
+    modulator = modulator_error_rad**2
     share = frames / (frames + modulator) if modulator > 0 else 1.0
     return expected_bits(np.array([share, modulator], np.float32), information)
 

@@ -43,9 +43,15 @@ def phase_errors(page: DecodedPage, symbols: NDArray[np.uint8], levels: int | Le
 
 def air_bits(page: DecodedPage, symbols: NDArray[np.uint8], data: NDArray[np.bool_], levels: int | Levels) -> float:
     """AIR of a page as delivered, over 256 levels whatever its own count is, bits per data symbol."""
+    return float(air_by_symbol(page, symbols, data, levels).mean())
+
+
+def air_by_symbol(
+    page: DecodedPage, symbols: NDArray[np.uint8], data: NDArray[np.bool_], levels: int | Levels
+) -> NDArray[np.float64]:
+    """Contribution of each data symbol to `air_bits`, bits, 1-D."""
     error = (page.phase - symbol_phases(symbols, levels))[data]
-    rates = achievable_rate(error, page.concentration[data], np.zeros(error.shape, np.int64), AIR_LEVELS)
-    return float(rates.mean())
+    return achievable_rate(error, page.concentration[data], np.zeros(error.shape, np.int64), AIR_LEVELS)
 
 
 @dataclass(frozen=True)

@@ -10,16 +10,14 @@ from lightpage.calibration.likelihood.noise import light_bits
 from lightpage.codec.code import Code
 from lightpage.codec.page_codec import PageCodec
 from lightpage.errors import BlackFrameError, InvalidInputError, LostPageError, SaturatedFrameError
-from lightpage.metrics.information import achievable_rate
-from lightpage.page.symbols import symbol_phases
 from lightpage.progress import Progress
 from lightpage.recording.reader import Recording
-from lightpage.runtime.archives.recordings.coded_pages import AIR_LEVELS
+from lightpage.runtime.archives.recordings.coded_pages import air_by_symbol
 from lightpage.runtime.archives.recordings.evaluation import decode_unseen, pilots_of
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
 
-MOST_PAGES = 4
+MOST_READ = 4
 """Largest number of pages that are read: their AIR is known to 0.02 bit on the bench device."""
 
 
@@ -69,12 +67,12 @@ def _rates(
     tracker = tracker_for(decoder)
     rates: list[NDArray[np.float64]] = []
     for number in range(recording.pages):
-        if len(rates) == MOST_PAGES:
+        if len(rates) == MOST_READ:
             break
         symbols = recording.symbols(number)
         if symbols is None:
             continue
-        progress("read known pages", len(rates) / MOST_PAGES)
+        progress("read known pages", len(rates) / MOST_READ)
         frames = recording.frames(number)
         try:
             page = decode_unseen(decoder, recording, tracker, mask, frames, symbols, in_sample=in_sample)
@@ -84,7 +82,5 @@ def _rates(
             rates.append(np.zeros(1))
             continue
         if page is not None:
-            errors = (page.phase - symbol_phases(symbols, decoder.bundle.levels(recording.levels)))[~mask]
-            zeros = np.zeros(errors.shape, np.int64)
-            rates.append(achievable_rate(errors, page.concentration[~mask], zeros, AIR_LEVELS))
+            rates.append(air_by_symbol(page, symbols, ~mask, decoder.bundle.levels(recording.levels)))
     return rates
