@@ -115,6 +115,8 @@ def calibrate(
         seconds = time.perf_counter() - start
         if not out.exists():
             calibration.save(out)  # an interrupted reading loses nothing
+        if bundle is not None:
+            bundle.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=None if bundle is None else bundle.parent) as folder:
             written = Path(folder) / (_BUNDLE if bundle is None else bundle.name)
             read = bundle is not None or (file.pages > len(chosen) and calibration.statistics is not None)

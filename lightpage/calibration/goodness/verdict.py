@@ -60,11 +60,12 @@ class Reading(TomlTable):
 
         Pages of the fit can only show that it is wrong.
         """
-        if self.in_sample and self.user_bytes:
+        is_good = self.share >= GOOD_SHARE
+        if not is_good and not self.user_bytes:
+            return "wrong"
+        if self.in_sample:
             return NOT_JUDGED
-        if self.share >= GOOD_SHARE:
-            return "good"
-        return "usable" if self.user_bytes else "wrong"
+        return "good" if is_good else "usable"
 
 
 class Goodness(TomlTable):

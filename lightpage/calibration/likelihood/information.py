@@ -23,8 +23,6 @@ _DEVIATIONS = 4.0
 is not smoothed. That of other symbols varies with the light of the others, on a page of the bench device by 0.18."""
 _MOST_SPREAD = 0.2
 """Largest standard deviation of the information about its median with which such symbols are told from chance."""
-_MAD = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation."""
 _DAMPING = 2.0
 """Factor on the information of such symbols. They share what little of their light the cameras measure, and steps by
 their own information alone would overshoot together, and swing."""
@@ -87,7 +85,7 @@ def _smoothed(information: Real) -> Real:
     """Smooth information [ny, nx] but that of symbols whose light lies beside a camera, which is damped."""
     usual = scipy.ndimage.median_filter(information, _MEDIAN)
     relative = information / np.where(usual > 0, usual, 1)
-    spread = _MAD * float(np.median(np.abs(relative - np.median(relative))))
+    spread = scipy.stats.median_abs_deviation(relative, axis=None, scale="normal")
     dark = (relative < 1 - _DEVIATIONS * spread) & (spread <= _MOST_SPREAD)
     total = scipy.ndimage.gaussian_filter(np.where(dark, 0, information), _SMOOTHED)
     weight = scipy.ndimage.gaussian_filter((~dark).astype(np.float64), _SMOOTHED)

@@ -65,6 +65,7 @@ def test_a_calibration_is_read_back_as_it_was_written(calibration: Calibration, 
         (READ.model_copy(update={"air_bits": 0.2, "user_bytes": 0}), "wrong", 6.7),
         (READ.model_copy(update={"in_sample": True}), "not judged", 1.2),
         (READ.model_copy(update={"in_sample": True, "air_bits": 0.2, "user_bytes": 0}), "wrong", 6.7),
+        (READ.model_copy(update={"in_sample": True, "user_bytes": 0}), "not judged", 1.2),
         (None, "not judged", 1.2),
     ],
 )
