@@ -20,8 +20,10 @@ import hashlib
 import json
 import statistics
 import sys
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
+from typing import Protocol, TypeVar
 
 import click
 
@@ -65,7 +67,17 @@ def summary(outcomes: list[Outcome]) -> dict[str, float | int | None]:
     }
 
 
-def load(path: Path, settings: dict[str, object]) -> dict[int, Outcome]:
+class Outcomes(Protocol):
+    """Figures of a device that is drawn by a seed."""
+
+    @property
+    def seed(self) -> int: ...
+
+
+T = TypeVar("T", bound=Outcomes)
+
+
+def load(path: Path, settings: dict[str, object], kind: Callable[..., T]) -> dict[int, T]:
     """Outcomes by seed of an earlier run with the same settings.
 
     Raises:
@@ -75,7 +87,7 @@ def load(path: Path, settings: dict[str, object]) -> dict[int, Outcome]:
         return {}
     try:
         data = json.loads(path.read_text("utf-8"))
-        found, outcomes = data["settings"], {o["seed"]: Outcome(**o) for o in data["outcomes"]}
+        found, outcomes = data["settings"], {o["seed"]: kind(**o) for o in data["outcomes"]}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InvalidInputError(f"--json {path}", error, "a file of this benchmark, or a new name") from None
     if found != settings:
@@ -114,7 +126,7 @@ def main(
         profile = profile.with_symbols_of(symbol_size)
     settings: dict[str, object] = {"format": FORMAT, "pages": pages, "foreign": foreign, "draw": draw}
     settings |= {"profile": profile_name, "profile_sha256": hashlib.sha256(profile.to_toml().encode()).hexdigest()}
-    done = {seed: o for seed, o in load(json_path, settings).items() if o.failure is None}
+    done = {seed: o for seed, o in load(json_path, settings, Outcome).items() if o.failure is None}
     bench = Bench(profile, pages, DRAWN[draw])
     click.echo(HEADER)
     seeds = range(first_seed, first_seed + devices)
