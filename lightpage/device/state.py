@@ -98,6 +98,8 @@ class Reference(TomlTable):
     tilt_y_rad: Phase = 1.0
     curvature_rad: Phase = 1.0
     """Phase at the corner of the page's image."""
+    recorded_exposure_relative: Annotated[float, Field(gt=0, le=10, allow_inf_nan=False)] = 1.0
+    """Exposure of the reference frames over that of pages, which is meant to be the same."""
 
 
 class Homodyne(TomlTable):
@@ -156,8 +158,12 @@ class Sensor(TomlTable):
     """Of either camera's pixels, that are always at full scale."""
     dust_specks: Annotated[int, Field(ge=0, le=10_000)] = 0
     """On either camera: each darkens some pixels about it, signal and reference alike."""
+    late_dust_specks: Annotated[int, Field(ge=0, le=10_000)] = 0
+    """Further specks, which settled after the references were recorded."""
     blemish_seed: Seed = 1
-    """Draws where both are; more of them are added to those of fewer."""
+    """Draws where all these are; more of them are added to those of fewer."""
+    black_level_relative: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)] = 0.0
+    """Counts without any light, in pages and references alike, over full scale."""
 
 
 class Drift(TomlTable):
@@ -165,6 +171,13 @@ class Drift(TomlTable):
 
     piston_rad: Few = 0.2
     shift_px: Few = 0.02
+    vibration_rad: Few = 0.0
+    """Standard deviation of the piston within an exposure: it takes contrast from the fringes."""
+
+    @property
+    def contrast(self) -> float:
+        """Contrast of the fringes over that without vibration."""
+        return math.exp(-(self.vibration_rad**2) / 2)
 
 
 class Device(TomlTable):

@@ -22,23 +22,31 @@ _SPECK_DEPTH = 0.3, 0.9
 """Shares of the light that they take off in the middle."""
 
 
-def in_phase_intensity(field: Complex, reference: Complex) -> Real:
-    """|E + R|^2: the s-polarised port of the homodyne detector (supplement S12, eq. 3-4, up to its constant)."""
-    intensity: Real = abs(field + reference) ** 2
-    return intensity
-
-
-def quadrature_intensity(field: Complex, reference: Complex, error: float = 0.0, sign: int = 1) -> Real:
-    """|E + i R|^2: the p-polarised port, where the quarter-wave plate has turned the signal against the reference.
+def in_phase_intensity(field: Complex, reference: Complex, contrast: float = 1.0) -> Real:
+    """|E + R|^2: the s-polarised port of the homodyne detector (supplement S12, eq. 3-4, up to its constant).
 
     Args:
         field: signal E, any shape.
         reference: reference R, same shape.
+        contrast: factor of the interference term.
+    """
+    intensity: Real = abs(field + reference) ** 2
+    if contrast != 1:
+        intensity = contrast * intensity + (1 - contrast) * (abs(field) ** 2 + abs(reference) ** 2)
+    return intensity
+
+
+def quadrature_intensity(
+    field: Complex, reference: Complex, error: float = 0.0, sign: int = 1, contrast: float = 1.0
+) -> Real:
+    """|E + i R|^2: the p-polarised port, where the quarter-wave plate has turned the signal against the reference.
+
+    Args:
+        field, reference, contrast: see `in_phase_intensity`.
         error: deviation of the turn from 90 degrees, radians.
         sign: -1 when the wave plate is mounted the other way and the turn is -90 degrees.
     """
-    intensity: Real = abs(field + reference * (sign * 1j * np.exp(1j * error))) ** 2
-    return intensity
+    return in_phase_intensity(field, reference * (sign * 1j * np.exp(1j * error)), contrast)
 
 
 @dataclass(frozen=True)
@@ -81,11 +89,13 @@ class Blemishes:
 
     Attributes:
         transmission: share of the light that dust lets through, float32 [rows, columns], or 1.
+        late_transmission: the same of dust that settled after the references were recorded.
         hot: pixels that are always at full scale, [rows, columns]; none if there are no such.
         engine: what the arrays belong to.
     """
 
     transmission: Real | float = 1.0
+    late_transmission: Real | float = 1.0
     hot: NDArray[np.bool_] | None = None
     engine: Engine = NUMPY
 
@@ -93,13 +103,16 @@ class Blemishes:
     def of(cls, camera: Camera, sensor: Sensor, which: int, engine: Engine = NUMPY) -> Self:
         """Draw those of camera number `which`, always the same."""
         shape = camera.rows_px, camera.columns_px
-        hot_rng, dust_rng = (np.random.default_rng([sensor.blemish_seed, which, kind]) for kind in range(2))
-        hot, transmission = None, None
+        hot_rng, dust_rng, late_rng = (np.random.default_rng([sensor.blemish_seed, which, kind]) for kind in range(3))
+        hot: NDArray[np.bool_] | None = None
+
+        def transmission(specks: int, rng: np.random.Generator) -> Real | float:
+            return engine.array(_behind_dust(shape, rng.random((specks, 4)))) if specks else 1.0
+
         if sensor.hot_pixel_share:
             hot = engine.array(hot_rng.random(shape, dtype=np.float32) < sensor.hot_pixel_share)
-        if sensor.dust_specks:
-            transmission = engine.array(_behind_dust(shape, dust_rng.random((sensor.dust_specks, 4))))
-        return cls(1.0 if transmission is None else transmission, hot, engine)
+        dust = transmission(sensor.dust_specks, dust_rng)
+        return cls(dust, transmission(sensor.late_dust_specks, late_rng), hot, engine)
 
     def counted(self, counts: Any, sensor: Sensor) -> Any:
         """Counts with those of hot pixels, in the type of the frames."""
@@ -150,5 +163,6 @@ def to_counts(electrons: Real, sensor: Sensor, engine: Engine = NUMPY) -> Real:
         electrons = engine.xp.clip(electrons, None, sensor.full_well_e)
         electrons = electrons * (1 + sensor.nonlinearity_relative * electrons / sensor.full_well_e)
     top = 2**sensor.bit_depth - 1
-    counts: Real = engine.xp.clip(engine.xp.round(electrons * (top / sensor.full_well_e)), 0, top)
+    black = sensor.black_level_relative * top
+    counts: Real = engine.xp.clip(engine.xp.round(electrons * (top / sensor.full_well_e) + black), 0, top)
     return counts

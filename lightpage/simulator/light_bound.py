@@ -30,7 +30,7 @@ class _View:
 
     Attributes:
         pose: pose of the camera.
-        amplitude: signal and reference, complex [y, x].
+        amplitude: signal and reference, the latter times the contrast of the fringes, complex [y, x].
         electrons_per_unit: electrons for a unit of intensity.
         weight: 1 over the variance of a pixel's electrons, [y, x]; 0 beside the frame and where the pixel is full.
         engine: what has computed them.
@@ -87,8 +87,10 @@ class LightBound:
         leaving = self._optics.exit_field(self._phase)
 
         def view(pose: CameraPose, turned: Complex, gain: float) -> _View:
-            amplitude, scale = self._optics.camera_field(leaving, pose) + turned, gain * self._optics.electrons_per_unit
-            return _View(pose, amplitude, scale, self._weight(scale * abs(amplitude) ** 2), self._optics.engine)
+            scale, contrast = gain * self._optics.electrons_per_unit, device.drift.contrast
+            amplitude = self._optics.camera_field(leaving, pose) + contrast * turned
+            electrons = scale * (abs(amplitude) ** 2 + (1 - contrast**2) * abs(turned) ** 2)
+            return _View(pose, amplitude, scale, self._weight(electrons), self._optics.engine)
 
         homodyne = device.homodyne
         turned = reference * np.exp(1j * homodyne.turn_rad)

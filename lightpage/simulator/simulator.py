@@ -191,12 +191,17 @@ class Simulator:
             if exit_field is not None and not together:
                 field = self.optics.camera_field(exit_field, pose) * piston
             if which:
-                intensity = homodyne.quadrature_gain * quadrature_intensity(field, reference, error, sign)
+                gain = homodyne.quadrature_gain
+                intensity = gain * quadrature_intensity(field, reference, error, sign, device.drift.contrast)
             else:
-                intensity = in_phase_intensity(field, reference)
+                intensity = in_phase_intensity(field, reference, device.drift.contrast)
             blemishes = self.optics.blemishes[which]
             seen = resample(intensity, *self.optics.camera_axes_m, *self.optics.view(pose, shift), engine)
             seen = seen * blemishes.transmission
+            if exit_field is None:
+                seen = seen * device.reference.recorded_exposure_relative
+            else:
+                seen = seen * blemishes.late_transmission
             if noise is None:
                 counts = to_counts(seen * self.optics.electrons_per_unit, device.sensor, engine)
             else:
