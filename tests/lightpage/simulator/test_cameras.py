@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lightpage.device.state import Aberration, CameraPose, Sensor
+from lightpage.device.state import Aberration, CameraPose, Drift, Sensor
 from lightpage.simulator.cameras import (
     CameraView,
     expose,
@@ -63,7 +63,20 @@ class TestInterference:
         )
 
 
+    def test_vibration_takes_contrast_as_the_mean_over_the_exposure_has_it(self) -> None:
+        field, reference = complex_noise(6, (50, 1)), complex_noise(7, (50, 1))
+        pistons, vibration = np.random.default_rng(8).standard_normal(200_000), Drift(vibration_rad=0.6)
+        within = np.mean(in_phase_intensity(field * np.exp(0.6j * pistons), reference), axis=1)
+        np.testing.assert_allclose(
+            in_phase_intensity(field, reference, vibration.contrast)[:, 0], within, atol=0.01 * within.max()
+        )
+
+
 class TestExposure:
+    def test_counts_without_light_are_the_black_level(self) -> None:
+        sensor = Sensor(read_noise_e=0, black_level_relative=0.1)
+        assert to_counts(np.array([0.0, 7500.0, 15_000.0]), sensor).tolist() == [26, 153, 255]
+
     def test_mean_and_variance_are_those_of_electrons_read_noise_and_rounding(self) -> None:
         sensor = Sensor(full_well_e=10_000, read_noise_e=30, bit_depth=8)
         electrons, pixels = 3000.0, 400_000

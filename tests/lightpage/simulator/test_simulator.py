@@ -295,6 +295,20 @@ class TestLight:
         signal, change = plain - quiet_frame(written=False), quiet_frame(f"{knob}={value}") - plain
         assert np.sum(change**2) == pytest.approx(10 ** (decibel / 10) * np.sum(signal**2), rel=0.07)
 
+    def test_dust_that_settles_later_is_on_pages_and_not_on_references(self) -> None:
+        late, plain = (quiet_frame(*settings, written=False) for settings in (("sensor.late_dust_specks=8",), ()))
+        assert np.array_equal(late, plain)
+        late, plain = quiet_frame("sensor.late_dust_specks=8"), quiet_frame()
+        bright = plain > 0.2 * plain.max()
+        assert 0.1 < np.min(late[bright] / plain[bright]) < 0.7
+        assert np.mean(late == plain) > 0.7
+
+    def test_references_may_have_another_exposure_than_pages(self) -> None:
+        setting = "reference.recorded_exposure_relative=0.8"
+        longer, plain = (quiet_frame(*settings, written=False) for settings in ((setting,), ()))
+        np.testing.assert_allclose(longer, 0.8 * plain, atol=1)
+        assert np.array_equal(quiet_frame(setting), quiet_frame())
+
 
 @cache
 def quiet_frame(*settings: str, written: bool = True) -> np.ndarray:
