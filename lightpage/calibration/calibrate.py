@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.coherence import COHERENT_BRANCHES, page_coherence
-from lightpage.calibration.goodness.measure import measure_goodness
-from lightpage.calibration.goodness.suspects import LEVELS, NEIGHBOURS
+from lightpage.calibration.goodness.measure import ShownPage, measure_goodness
+from lightpage.calibration.goodness.remedies import LEVELS, NEIGHBOURS
 from lightpage.calibration.goodness.verdict import USABLE, Goodness
 from lightpage.calibration.interfaces import FieldSolver, RememberingTwin, Twin
 from lightpage.calibration.parameters import NAMES, PARAMETERS, PRIORS, Prior, indices, nominal
@@ -297,7 +297,8 @@ def check_agreement(coherences: Sequence[float]) -> None:
 
 def _by_modulator(found: Registered) -> bool:
     """Return whether bits are lost by what the modulator shows: no other place of the cameras explains that."""
-    return found.goodness is not None and found.goodness.cause in (LEVELS, NEIGHBOURS)
+    causes = found.goodness.causes if found.goodness is not None else ()
+    return bool(causes) and causes[0].name in (LEVELS, NEIGHBOURS)
 
 
 def _bits_lost(found: Registered) -> float:
@@ -370,7 +371,7 @@ def goodness_of(
     found = fit.fit(start, turn, group, start, _HELD, progress, levels, effort="once")
     if not np.isfinite(found.residual):
         raise CalibrationError("calibration, verdict", "no light of a page", "some")
-    return measure_goodness(twin, device, found.conditions, page.pair, page.symbols, progress)
+    return measure_goodness(twin, [ShownPage(device, found.conditions, page.pair, page.symbols)], progress)
 
 
 def least_coherence(symbols: int) -> float:
@@ -655,7 +656,8 @@ class _Registration:
             self.profile, self.parameters, self.quadrature_phase, self.references, self.modulation
         )
         page = self.pages[0]
-        return measure_goodness(self.twin, device, self.conditions, page.pair, page.symbols, self.tell)
+        shown = ShownPage(device, self.conditions, page.pair, page.symbols)
+        return measure_goodness(self.twin, [shown], self.tell)
 
     def _share(self, branch: str) -> float:
         """Share of the patches of a branch that the last stage found."""

@@ -13,7 +13,7 @@ from pydantic import AfterValidator, Field, field_serializer
 
 from lightpage.calibration.calibrate import Registered
 from lightpage.calibration.calibrated_device import CalibratedDevice
-from lightpage.calibration.goodness.suspects import unlike_profile
+from lightpage.calibration.goodness.causes import unlike_profile
 from lightpage.calibration.goodness.verdict import GOOD, NOT_JUDGED, USABLE, Goodness, Reading
 from lightpage.calibration.likelihood.statistics import Statistics
 from lightpage.calibration.parameters import KNOWN, NAMES, as_dict, as_vector

@@ -77,6 +77,7 @@ def calibrate_by_graphs(
         blemishes.references,
         known,
         lambda share: refining("likelihood of all known pages", share),
+        blemishes.gains,
     )
     refined, statistics = fit.refined(registered, registered.conditions)
     _check_planes(decoder, refined)

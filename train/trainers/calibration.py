@@ -69,6 +69,7 @@ def calibrate_recording(
         blemishes.references,
         known,
         lambda share: refining("likelihood of all known pages", share),
+        blemishes.gains,
     )
     refined, statistics = fit.refined(registered, registered.conditions)
     return Calibration.from_registered(refined, profile, hashes, statistics, counts)

@@ -49,6 +49,9 @@ class PageLight:
         fields: light that the model predicts for each camera.
         counts: frames minus references, over twice the references, [2, Gy, Gx].
         references: counts of the references, [2, Gy, Gx].
+        visible: places of the grid that both cameras see, [Gy, Gx].
+        every: slices of the grid to the coarse grid.
+        pair: frames of the page.
     """
 
     def __init__(
@@ -62,11 +65,11 @@ class PageLight:
         profile = device.profile
         self._twin = twin
         self._device = device
-        self._pair = pair
+        self.pair = pair
         self._samples = symbol_samples(profile)
         self._grid = field_grid(profile)
         self._stride = max(_LEAST_STRIDE, int(np.sqrt(np.prod(self._grid.shape) / _EQUATIONS)))
-        self._every = (slice(None, None, self._stride), slice(None, None, self._stride))
+        self.every = (slice(None, None, self._stride), slice(None, None, self._stride))
         self._blur = conditions.blur
         self.waves = FittedWaves(profile, device.parameters, self._samples, filled=True, blur=self._blur)
         self._terms = np.stack(illumination_terms(self.waves.x, self.waves.y))
@@ -78,14 +81,14 @@ class PageLight:
         pixels = twin.pixels(device.parameters, places).reshape(2, *self._grid.shape, 2)
         edge = len(self._grid.prefilter)
         size = np.array(pair.in_phase.shape[::-1])
-        self._visible = np.all((pixels > edge) & (pixels < size - edge), axis=(0, 3))
+        self.visible = np.all((pixels > edge) & (pixels < size - edge), axis=(0, 3))
         self._at = _rows_and_columns(pixels)
         self._smooth_references = [
             smooth_reference(each) for each in (device.references.in_phase, device.references.quadrature)
         ]
         self.references = _interpolated(self._smooth_references, self._at)
         amplitude = np.sqrt(self.references[0])
-        self._amplitude = amplitude / amplitude[self._visible].mean()
+        self._amplitude = amplitude / amplitude[self.visible].mean()
         self._arms = np.exp(1j * np.array([0.0, device.quadrature_phase_rad]))[:, None, None]
         references = device.references
         differences = [
@@ -101,7 +104,7 @@ class PageLight:
     @property
     def residual(self) -> Complex:
         """Residual of the model, as light of both cameras that would explain it, complex [2, Gy, Gx]."""
-        return self._explaining_light(self._count_residual)
+        return self._explaining_light(self.count_residual)
 
     def observed_change(self, change: Complex) -> Complex:
         """Estimate a small change of both cameras' light from their equations, which miss its other quadrature."""
@@ -117,7 +120,23 @@ class PageLight:
 
     def frame_noise(self) -> Complex:
         """Draw noise with the variance of the frames', and return it as light of both cameras."""
-        pair = self._pair
+        return self._explaining_light(self._drawn_counts)
+
+    def noise_equations(self, modulator_variance_rad2: float) -> Real:
+        """Draw noise of the equations on the coarse grid, over their noise, flat.
+
+        Args:
+            modulator_variance_rad2: variance of the modulator's phase, a sample.
+        """
+        deviation = np.sqrt(modulator_variance_rad2)
+        noise = deviation * np.random.default_rng(1).standard_normal(self.page.shape)
+        by_modulator = self.waves.to_cameras(1j * noise * self.page)[:, *self.every]
+        return self.equations(self._drawn_counts) + self.equations_of(by_modulator)
+
+    @cached_property
+    def _drawn_counts(self) -> Real:
+        """Noise with the variance of the frames', over twice the references, [2, Gy, Gx]."""
+        pair = self.pair
         references = self._device.references
         frames = [pair.in_phase, references.in_phase, pair.quadrature, references.quadrature]
         in_phase, quadrature = self.expected_frames()
@@ -126,7 +145,7 @@ class PageLight:
         noise = list(in_parallel(lambda one: noise_like(*one), drawn))
         differences = [noise[0] - noise[1], noise[2] - noise[3]]
         images = _filtered(differences, self._grid.prefilter)
-        return self._explaining_light(_interpolated(images, self._at) / (2 * self.references))
+        return _interpolated(images, self._at) / (2 * self.references)
 
     def modulator_noise(self) -> Complex:
         """Draw phase noise of the modulator, 1 rad a sample, and return it as light of both cameras, to first order."""
@@ -175,37 +194,68 @@ class PageLight:
         for camera, (level, brightness) in enumerate(zip(self.references, self.brightness, strict=True)):
             expected = level * brightness
             counts = level * (1 + 2 * self.counts[camera])
-            excess = CountCurve.measured(expected[self._visible], (counts - expected)[self._visible])
+            excess = CountCurve.measured(expected[self.visible], (counts - expected)[self.visible])
             self._excess[camera] = excess.at(expected) / (2 * level)
 
     def equations(self, residual: Real) -> Real:
         """Weigh equations [2, Gy, Gx], or those of the coarse grid, by their noise; on the coarse grid, flat."""
-        if residual.shape[1:] == self._visible.shape:
-            residual = residual[:, *self._every]
-        weighted = residual / np.sqrt(np.abs(self._count_gradient(self._every)) ** 2 + READ_NOISE)
-        return np.asarray(weighted[:, self._visible[self._every]].ravel())
+        if residual.shape[1:] == self.visible.shape:
+            residual = residual[:, *self.every]
+        weighted = residual / np.sqrt(np.abs(self._count_gradient(self.every)) ** 2 + READ_NOISE)
+        return np.asarray(weighted[:, self.visible[self.every]].ravel())
 
     def equations_of(self, change: Complex) -> Real:
         """Change of the equations, flat, by a small change of both cameras' light on the coarse grid."""
-        return self.equations((change / self._amplitude[self._every] * self._count_gradient(self._every).conj()).real)
+        return self.equations((change / self._amplitude[self.every] * self._count_gradient(self.every).conj()).real)
 
     def equations_of_fit(self) -> Iterator[Real]:
         """Yield the change of the equations, flat, by a small change of each parameter that the twin knows."""
         leaving = self.coarse.to_exit(self.page)
         fields = self.coarse.from_exit(leaving)
-        places = np.stack(np.meshgrid(self._grid.x_m, self._grid.y_m), axis=-1)[self._every]
+        places = np.stack(np.meshgrid(self._grid.x_m, self._grid.y_m), axis=-1)[self.every]
         for index in range(min(self._twin.known, len(PARAMETERS))):
             moved = self._device.parameters.copy()
             moved[index] += STEPS[index]
             if index in SEEN_BY_CAMERAS:
                 at = _rows_and_columns(self._twin.pixels(moved, places.reshape(-1, 2)).reshape(2, *places.shape))
                 yield self.equations(
-                    _interpolated(self._images, at) / (2 * self.references[:, *self._every])
-                    - self.counts[:, *self._every]
+                    _interpolated(self._images, at) / (2 * self.references[:, *self.every])
+                    - self.counts[:, *self.every]
                 )
             else:
                 changed = self.coarse.moved(index, self.changed(moved), self.page, leaving, fields)
                 yield self.equations_of(changed - fields)
+
+    def interference_and_power(self) -> tuple[Real, Real]:
+        """Interference and power of the predicted light, over the reference's power, [2, Gy, Gx] each."""
+        field = self.fields / self._amplitude
+        return np.asarray(2 * (field * self._arms.conj()).real), np.asarray(np.abs(field) ** 2)
+
+    def equations_of_contrast(self) -> list[Real]:
+        """Change of the equations, flat, by more signal with as much interference, and by more of both; each camera's.
+
+        The part that depends on the expected count alone is taken off, as `correct_counts` takes it off the residual.
+        """
+        interference, power = self.interference_and_power()
+        columns = []
+        for camera, (level, brightness) in enumerate(zip(self.references, self.brightness, strict=True)):
+            expected = level * brightness
+            for term in (power[camera] / 2, interference[camera] / 2 + power[camera]):
+                curve = CountCurve.measured(expected[self.visible], term[self.visible])
+                change = np.zeros_like(self.counts)
+                change[camera] = term - curve.at(expected)
+                columns.append(self.equations(change))
+        return columns
+
+    def equations_near(self, pixels: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return which equations, flat, take in one of some pixels of either camera, [2, H, W]."""
+        reach = len(self._grid.prefilter) // 2 + 1
+        near = np.stack([scipy.ndimage.binary_dilation(each, iterations=reach) for each in pixels])
+        chosen = [
+            scipy.ndimage.map_coordinates(one.astype(np.uint8), at, order=0, mode="nearest")
+            for one, at in zip(near, self._at, strict=True)
+        ]
+        return np.asarray(np.stack(chosen)[:, *self.every][:, self.visible[self.every]].ravel() > 0)
 
     @property
     def coarse_places(self) -> tuple[Real, Real]:
@@ -222,7 +272,7 @@ class PageLight:
     @property
     def equation_residual(self) -> Real:
         """Residual of the equations on the coarse grid, over their noise, flat."""
-        return self.equations(self._count_residual)
+        return self.equations(self.count_residual)
 
     @cached_property
     def coarse(self) -> FittedWaves:
@@ -237,7 +287,7 @@ class PageLight:
         return FittedWaves(self._device.profile, parameters, samples or self._samples, **coarse)
 
     @property
-    def _count_residual(self) -> Real:
+    def count_residual(self) -> Real:
         """Measured minus predicted counts, over twice the reference's, [2, Gy, Gx]."""
         field = self.fields / self._amplitude
         return np.asarray(self.counts - self._excess - (field * self._arms.conj()).real - np.abs(field) ** 2 / 2)
@@ -249,7 +299,7 @@ class PageLight:
     def _explaining_light(self, residual: Real) -> Complex:
         """Light of both cameras that explains residuals of their equations [2, Gy, Gx], weighted by their noise."""
         gradient = self._count_gradient()
-        return np.asarray(self._visible * self._amplitude * gradient * residual / (np.abs(gradient) ** 2 + READ_NOISE))
+        return np.asarray(self.visible * self._amplitude * gradient * residual / (np.abs(gradient) ** 2 + READ_NOISE))
 
 
 def places_on_facet(waves: FittedWaves) -> tuple[Real, Real]:

@@ -10,18 +10,47 @@ errors of amplitude, beyond those of noise, are errors that a better model would
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from lightpage.calibration.calibrated_device import CalibratedDevice
+from lightpage.calibration.goodness.camera_faults import (
+    CONTRAST,
+    CountTerms,
+    contrast_bits,
+    count_terms,
+    named_contrast,
+    shadows,
+)
+from lightpage.calibration.goodness.causes import shares_of, unlike_profile
 from lightpage.calibration.goodness.light import PageLight
-from lightpage.calibration.goodness.suspects import LEVELS, NEIGHBOURS, likeliest, unlike_profile
-from lightpage.calibration.goodness.verdict import GOOD, USABLE, Goodness, Map
+from lightpage.calibration.goodness.page_errors import (
+    Explained,
+    dead_pixels,
+    steps_to_neighbours,
+    without_flicker,
+    without_levels,
+    without_neighbours,
+)
+from lightpage.calibration.goodness.remedies import (
+    CAMERA_PIXELS,
+    DEAD_PIXELS,
+    DUST,
+    FLICKER,
+    LEVELS,
+    NEIGHBOURS,
+    OTHER_SYMBOLS,
+    UNKNOWN,
+    VIBRATION,
+    cause_of,
+)
+from lightpage.calibration.goodness.verdict import GOOD, USABLE, Cause, Goodness, Map
 from lightpage.calibration.interfaces import Twin
-from lightpage.calibration.waves.wave_model import LaunchConditions
+from lightpage.calibration.waves.wave_model import LaunchConditions, on_modulator
 from lightpage.errors import CalibrationError
 from lightpage.recording.frame_pair import FramePair
 
@@ -44,49 +73,88 @@ _BLOCKS = (6, 8)
 """Largest numbers of rows and columns of the maps."""
 _MOST_RATIO = 1e6
 """Largest ratio in the maps."""
+_FOREIGN = 0.1
+"""Least mean square of the symbols' relative errors that shows the light of other symbols."""
+_LEAST_SHARE = 0.2
+"""Least share of what is lost that the largest cause makes, to be called the likeliest one."""
+_LEAST_BITS = 0.005
+"""Least information that a named cause costs, bits a symbol."""
+
+
+class ShownPage(NamedTuple):
+    """Known page as a fitted device shows it.
+
+    Attributes:
+        device: fitted device, with the page's own tilt and shift.
+        conditions: the page's illumination and blur.
+        pair: frames of the page.
+        symbols: unit phasors of the page's symbols [ny, nx].
+    """
+
+    device: CalibratedDevice
+    conditions: LaunchConditions
+    pair: FramePair
+    symbols: NDArray[np.complex128]
+
+
+class _PageErrors(NamedTuple):
+    """Light of a page, and the errors of its symbols.
+
+    Attributes:
+        light: light of the page, after its corrections.
+        terms: terms of both cameras' counts.
+        residual: residual of the model on the exit facet.
+        gain: gain of each symbol, [ny, nx].
+        visible: symbols whose light both cameras see, [ny, nx].
+        errors: relative errors without their smooth part and without the page's edges.
+        phases: phases of the levels, without the page's edges.
+        neighbourhood: see `steps_to_neighbours`, without the page's edges.
+    """
+
+    light: PageLight
+    terms: list[CountTerms]
+    residual: Complex
+    gain: NDArray[np.floating]
+    visible: NDArray[np.bool_]
+    errors: Complex
+    phases: Real
+    neighbourhood: Real
+
+    def rough(self, leaving: Complex) -> Complex:
+        """Errors of symbols by light on the exit facet, see `errors`."""
+        return _rough(self.light.errors(leaving), self.gain, self.visible)
 
 
 def measure_goodness(
     twin: Twin,
-    device: CalibratedDevice,
-    conditions: LaunchConditions,
-    pair: FramePair,
-    symbols: NDArray[np.complex128],
+    pages: Sequence[ShownPage],
     progress: Callable[[float], None] = lambda share: None,
+    *,
+    gains: NDArray[np.uint8] | None = None,
+    explained_from: float = GOOD,
 ) -> Goodness:
-    """Measure how well a fitted device explains the light of a known page.
+    """Measure how well a fitted device explains the light of a known page, and what causes the rest.
 
     Args:
         twin: ray tracer of the nominal device.
-        device: fitted device.
-        conditions: the page's illumination and blur.
-        pair: frames of the page.
-        symbols: unit phasors of the page's symbols [ny, nx].
+        pages: page that is measured, and others of the same device. They tell what changes from page to page, and what
+            stays.
         progress: called with the finished share of the work.
+        gains: gains of the cameras' pixels, which are 0 where they have no signal, [2, H, W]; None if unknown.
+        explained_from: loss, bits a symbol, from which on its causes are searched.
 
     Raises:
         CalibrationError: the cameras see the light of no symbol.
     """
-    light = PageLight(twin, device, conditions, pair, symbols)
-    progress(0.2)
-    light.correct_amplitude()
-    light.correct_counts()
-    progress(0.4)
+    page = _page_errors(twin, pages[0], progress)
+    light = page.light
     back = light.waves.back_to_exit
-    residual = back(light.residual)
     frame_noise = back(light.frame_noise())
     modulator_noise = back(light.modulator_noise())
-    progress(0.6)
-    gain = _smooth(light.errors(back(light.observed_change(light.fields))).real)
-    visible = gain > _LEAST_GAIN * max(float(np.median(gain)), _TINY)
-    if not visible.any():
-        raise CalibrationError("calibration, verdict", "no symbol whose light both cameras see", "some")
-    errors, frame_errors, modulator_errors = (
-        _rough(light.errors(each), gain, visible) for each in (residual, frame_noise, modulator_noise)
-    )
-    phases = np.mod(np.angle(symbols), 2 * np.pi)
-    errors, by_neighbours = _without_neighbours(errors, phases)
-    errors, by_level = _without_levels(errors, phases)
+    frame_errors, modulator_errors = page.rough(frame_noise), page.rough(modulator_noise)
+    by_neighbours = without_neighbours(page.errors, page.neighbourhood)
+    by_level = without_levels(by_neighbours.residual, page.phases)
+    errors = by_level.residual
     progress(0.8)
     # A better model would explain errors of amplitude and of phase alike; noise of the modulator is mostly of phase.
     total, frames, modulator = (_powers(each) for each in (errors, frame_errors, modulator_errors))
@@ -97,26 +165,133 @@ def measure_goodness(
     amount = min(beyond / modulator[1], _MOST_MODULATOR_NOISE_RAD2)
     unexplained += beyond - amount * modulator[1]
     noise = frames + amount * modulator
-    wrong = unexplained + by_level + by_neighbours
-    lost = float(np.log2(1 + wrong / (noise[1] + _OWN_ERROR_RAD**2))) / 2
-    cause = unlike_profile(device.parameters)
-    good = lost < GOOD and not cause
-    if lost >= GOOD and not cause:
-        shares = {LEVELS: by_level, NEIGHBOURS: by_neighbours}
-        largest = max(shares, key=lambda words: shares[words])
-        cause = largest if shares[largest] > wrong / 2 else likeliest(light, errors)
+    wrong = unexplained + by_level.variance + by_neighbours.variance
+    variance = noise[1] + _OWN_ERROR_RAD**2
+    lost = float(np.log2(1 + wrong / variance)) / 2
+    other_profile = unlike_profile(pages[0].device.parameters)
+    by_symbols = {LEVELS: by_level, NEIGHBOURS: by_neighbours}
+    causes: tuple[Cause, ...] = ()
+    if lost >= explained_from or contrast_bits(page.terms) >= explained_from:
+        causes = _causes(twin, pages, page, errors, by_symbols, unexplained, variance, amount, gains)
+    cause = other_profile or (_sentence(causes) if lost >= GOOD else "")
     return Goodness(
-        verdict="good" if good else "usable" if lost < USABLE else "wrong",
+        verdict="good" if lost < GOOD and not cause else "usable" if lost < USABLE else "wrong",
         bits_lost=lost,
-        unexplained_relative=2 * unexplained + by_level + by_neighbours,
+        unexplained_relative=2 * unexplained + by_level.variance + by_neighbours.variance,
         noise_relative=float(noise.sum()),
         modulator_noise_rad=float(np.sqrt(amount)),
         by_page=_map(errors, frame_errors, amount, modulator_errors),
-        by_facet=_map(residual, frame_noise, amount, modulator_noise),
+        by_facet=_map(page.residual, frame_noise, amount, modulator_noise),
         cause=cause,
         frame_error_rad=float(np.sqrt(frames[1])),
         modulator_error_rad=float(np.sqrt(amount * modulator[1])),
+        causes=causes,
     )
+
+
+def _page_errors(twin: Twin, page: ShownPage, progress: Callable[[float], None] = lambda share: None) -> _PageErrors:
+    """Project the residual of a page to errors of its symbols.
+
+    Raises:
+        CalibrationError: the cameras see the light of no symbol.
+    """
+    light = PageLight(twin, *page)
+    progress(0.2)
+    light.correct_amplitude()
+    terms = count_terms(light)
+    light.correct_counts()
+    progress(0.4)
+    back = light.waves.back_to_exit
+    residual = back(light.residual)
+    gain = _smooth(light.errors(back(light.observed_change(light.fields))).real)
+    visible = gain > _LEAST_GAIN * max(float(np.median(gain)), _TINY)
+    if not visible.any():
+        raise CalibrationError("calibration, verdict", "no symbol whose light both cameras see", "some")
+    errors = _rough(light.errors(residual), gain, visible)
+    phases = np.mod(np.angle(page.symbols), 2 * np.pi)
+    inside = slice(_EDGE, -_EDGE), slice(_EDGE, -_EDGE)
+    neighbourhood = steps_to_neighbours(phases)[:, *inside]
+    progress(0.6)
+    return _PageErrors(light, terms, residual, gain, visible, errors, phases[inside], neighbourhood)
+
+
+def _causes(
+    twin: Twin,
+    pages: Sequence[ShownPage],
+    page: _PageErrors,
+    errors: Complex,
+    by_symbols: dict[str, Explained],
+    unexplained: float,
+    variance: float,
+    amount: float,
+    gains: NDArray[np.uint8] | None,
+) -> tuple[Cause, ...]:
+    """Split what is lost among its causes, the largest first.
+
+    Args:
+        twin: ray tracer of the nominal device.
+        pages: known pages.
+        page: the first of them, measured.
+        errors: errors of its symbols without those of levels and neighbours.
+        by_symbols: what levels and neighbours explain of them, by the name of the cause.
+        unexplained: phase variance that a better model would explain.
+        variance: phase variance of noise.
+        amount: variance of the modulator's phase noise, a sample.
+        gains: gains of the cameras' pixels, [2, H, W]; None if unknown.
+    """
+    every = [page, *(_page_errors(twin, other) for other in pages[1:])]
+    kept, flicker = without_flicker([each.errors for each in every], [each.phases for each in every])
+    kept = [without_levels(each, one.phases).residual for each, one in zip(kept, every, strict=True)]
+    dead = dead_pixels(kept, variance)
+    variances = {name: each.variance for name, each in by_symbols.items()}
+    variances |= {FLICKER: flicker, LEVELS: max(0.0, variances[LEVELS] - flicker)}
+    light = page.light
+    explained = np.zeros(page.gain.shape, np.complex128)
+    parts = sum((each.part for each in by_symbols.values()), np.where(dead.where, kept[0], 0))
+    explained[_EDGE:-_EDGE, _EDGE:-_EDGE] = parts
+    known = on_modulator(explained, light.waves.samples)
+    rest = max(0.0, unexplained - dead.power)
+    dark = np.stack([shadows(*_frames_of(every, camera)) for camera in range(2)])
+    places = {DUST: light.equations_near(dark)}
+    if gains is not None:
+        places[CAMERA_PIXELS] = light.equations_near(gains == 0)
+    noise = light.noise_equations(amount)
+    shares = shares_of(light, noise, known, places)
+    contrast = named_contrast(page.terms)
+    for name, share in shares.items():
+        variances[contrast or CONTRAST if name == CONTRAST else name] = share * rest
+    wrong = sum(variances.values()) + max(0.0, rest * (1 - sum(shares.values())))
+    lost = float(np.log2(1 + wrong / variance)) / 2
+    bits = {name: lost * each / max(wrong, _TINY) for name, each in variances.items()}
+    bits[DEAD_PIXELS] = dead.bits
+    if contrast == VIBRATION:
+        bits[VIBRATION] = bits.get(VIBRATION, 0.0) + contrast_bits(page.terms)
+    unknown = lost * max(0.0, 1 - sum(variances.values()) / max(wrong, _TINY))
+    foreign = np.mean(np.abs(errors) ** 2) > _FOREIGN
+    bits[OTHER_SYMBOLS if foreign else UNKNOWN] = unknown
+    details = {DEAD_PIXELS: str(dead)}
+    found = [cause_of(name, each, details.get(name, "")) for name, each in bits.items() if each >= _LEAST_BITS]
+    return tuple(sorted(found, key=lambda cause: (cause.name == UNKNOWN, -cause.bits)))
+
+
+def _frames_of(
+    pages: Sequence[_PageErrors], camera: int
+) -> tuple[list[NDArray[np.integer]], list[NDArray[np.float32]]]:
+    """Frames of one camera, and the counts that the model expects of them."""
+    frames = [(page.light.pair.in_phase, page.light.pair.quadrature)[camera] for page in pages]
+    return frames, [page.light.expected_frames()[camera] for page in pages]
+
+
+def _sentence(causes: Sequence[Cause]) -> str:
+    """Largest cause in words, with its share of what is lost; empty where there is none.
+
+    Where all named causes together are little, it is that the cause is unknown.
+    """
+    total = sum(cause.bits for cause in causes)
+    if not total:
+        return ""
+    shown = causes[0] if causes[0].bits >= _LEAST_SHARE * total else causes[-1]
+    return f"{shown.what} ({shown.bits / total:.0%} of what is lost)"
 
 
 def _smooth(errors: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -131,36 +306,6 @@ def _rough(errors: Complex, gain: NDArray[np.floating], visible: NDArray[np.bool
     relative = np.where(visible, errors, 0) / np.where(visible, gain, 1)
     rough = (relative - _smooth(relative.real) - 1j * _smooth(relative.imag)) * visible / np.sqrt(visible.mean())
     return np.asarray(rough[_EDGE:-_EDGE, _EDGE:-_EDGE])
-
-
-def _without_levels(errors: Complex, phases: Real) -> tuple[Complex, float]:
-    """Errors minus the mean of their level, and the phase variance of these means beyond that of chance."""
-    _, level = np.unique(np.round(phases[_EDGE:-_EDGE, _EDGE:-_EDGE].ravel(), 6), return_inverse=True)
-    count = np.bincount(level)
-    flat = errors.ravel()
-    mean = (np.bincount(level, flat.real) + 1j * np.bincount(level, flat.imag)) / count
-    several = count[level] > 1
-    unbiased = np.sqrt(count[level] / np.maximum(count[level] - 1, 1))
-    residual = np.where(several, (flat - mean[level]) * unbiased, flat)
-    chance = np.mean(residual.imag**2) * len(count) / len(flat)
-    return residual.reshape(errors.shape), max(0.0, float(np.mean(mean.imag[level] ** 2) - chance))
-
-
-def _without_neighbours(errors: Complex, phases: Real) -> tuple[Complex, float]:
-    """Errors minus phases that depend on the neighbouring symbols, and the variance of these beyond that of chance.
-
-    Fringing fields between the modulator's pixels cause such phases, which follow the steps to the neighbours. The fit
-    of the stroke already explains the part that depends on the symbol's own level.
-    """
-    columns = []
-    for axis in (0, 1):
-        beside = [np.roll(phases, shift, axis) for shift in (1, -1)]
-        columns += [beside[0] + beside[1] - 2 * np.pi, np.sin(beside[0] - phases) + np.sin(beside[1] - phases)]
-    matrix = np.stack([column[_EDGE:-_EDGE, _EDGE:-_EDGE].ravel() for column in columns], axis=1)
-    explained = matrix @ np.linalg.lstsq(matrix, errors.imag.ravel(), rcond=None)[0]
-    residual = errors - 1j * explained.reshape(errors.shape)
-    chance = len(columns) * np.mean(residual.imag**2) / residual.size
-    return residual, max(0.0, float(np.mean(explained**2) - chance))
 
 
 def _powers(errors: Complex) -> Real:

@@ -68,6 +68,22 @@ class Reading(TomlTable):
         return "good" if is_good else "usable"
 
 
+class Cause(TomlTable):
+    """Cause of light that a fit does not explain, or of light that the device loses.
+
+    Attributes:
+        name: name of the cause, see `lightpage.calibration.goodness.remedies`.
+        bits: information that it costs, bits a symbol, estimated.
+        what: the cause in words, with its places.
+        remedy: what a user can do about it.
+    """
+
+    name: str
+    bits: NonNegative
+    what: str
+    remedy: str
+
+
 class Goodness(TomlTable):
     """Goodness of fit: how well a calibration explains the light of a known page.
 
@@ -83,7 +99,8 @@ class Goodness(TomlTable):
             modulator; None in documents of before.
         by_page: power of the residual over that of noise, in blocks over the page, rows from the top; 1 is noise alone.
         by_facet: the same over the pipe's exit facet.
-        cause: likeliest error, in words; empty where nothing is wrong.
+        cause: largest cause, in words; empty where nothing is wrong.
+        causes: causes of what is lost, the largest first; empty where little is lost, and in documents of before.
     """
 
     verdict: Verdict
@@ -96,3 +113,4 @@ class Goodness(TomlTable):
     cause: str
     frame_error_rad: NonNegative | None = None
     modulator_error_rad: NonNegative | None = None
+    causes: Annotated[tuple[Cause, ...], Field(strict=False)] = ()

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lightpage.calibration.calibrate import KnownPage, Registered
 from lightpage.calibration.calibrated_device import CalibratedDevice
-from lightpage.calibration.goodness.measure import measure_goodness
+from lightpage.calibration.goodness.measure import ShownPage, measure_goodness
 from lightpage.calibration.goodness.verdict import Goodness
 from lightpage.calibration.interfaces import Twin
 from lightpage.calibration.likelihood.interfaces import Derivatives, PageLikelihood, ProgressCallback
@@ -56,6 +56,10 @@ _ROUNDS = 3
 _LEAST_GAIN = 20.0
 """Expected gain of the log-likelihood by a step, nats an unknown, below which another one does not pay. At 32 electrons
 the first step gains 11 on the bench device, and a second one 0.04."""
+_JUDGED = 2
+"""Number of known pages that tell causes."""
+_EXPLAINED_FROM = 0.02
+"""Loss, bits a symbol, from which on its causes are searched."""
 _LINEARISED = 0.75
 """Share of a round's work after which the next device is known, and its statistics are measured."""
 _TURN_STEP_RAD = 0.01
@@ -99,6 +103,7 @@ class DeviceFit:
         references: reference-only frames.
         pages: known pages.
         progress: called with the finished share of the work.
+        gains: gains of the cameras' pixels, see `Blemishes`, [2, H, W].
     """
 
     def __init__(
@@ -109,6 +114,7 @@ class DeviceFit:
         references: FramePair,
         pages: Sequence[KnownPage],
         progress: ProgressCallback = lambda share: None,
+        gains: NDArray[np.uint8] | None = None,
     ) -> None:
         self._likelihood = likelihood
         self._twin = twin
@@ -116,6 +122,7 @@ class DeviceFit:
         self._references = references
         self._pages = pages
         self._progress = progress
+        self._gains = gains
         self._grid = field_grid(profile)
 
     def refined(self, registered: Registered, conditions: LaunchConditions) -> tuple[Registered, Statistics]:
@@ -153,19 +160,22 @@ class DeviceFit:
             statistics = moved_statistics
             if solution.gain < _LEAST_GAIN * len(solution.step):
                 break
-        goodness = self._goodness(current, conditions, fit.pages[0])
+        goodness = self._goodness(current, conditions, fit.pages)
         self._progress(1.0)
         at_mean = _at_page(current.parameters, np.mean([page.nuisance for page in fit.pages], axis=0))
         parameters = np.where(registered.deviations > 0, at_mean, current.parameters)
         return replace(current, parameters=parameters, goodness=goodness), statistics
 
-    def _goodness(self, registered: Registered, conditions: LaunchConditions, page: FittedPage) -> Goodness:
-        """Judge a registration by the light of its first page, with the gain, tilt and shift of `page`."""
+    def _goodness(self, registered: Registered, conditions: LaunchConditions, pages: Sequence[FittedPage]) -> Goodness:
+        """Judge a registration by the light of its first page; the next one tells causes that stay, and that change."""
         illumination = conditions.illumination
-        launched = conditions._replace(illumination=illumination * (page.gain * abs(illumination[0]) / illumination[0]))
-        known = self._pages[0]
-        moved = replace(registered, parameters=_at_page(registered.parameters, page.nuisance))
-        return measure_goodness(self._twin, self._device(moved), launched, known.pair, known.symbols)
+        phase = abs(illumination[0]) / illumination[0]
+        shown = []
+        for page, known in zip(pages[:_JUDGED], self._pages, strict=False):
+            moved = replace(registered, parameters=_at_page(registered.parameters, page.nuisance))
+            launched = conditions._replace(illumination=illumination * (page.gain * phase))
+            shown.append(ShownPage(self._device(moved), launched, known.pair, known.symbols))
+        return measure_goodness(self._twin, shown, gains=self._gains, explained_from=_EXPLAINED_FROM)
 
     def _device(self, registered: Registered) -> CalibratedDevice:
         return CalibratedDevice(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.goodness.frame_noise import noise_curve, noise_like, on_pixels
 from lightpage.calibration.goodness.light import PageLight
-from lightpage.calibration.goodness.measure import measure_goodness
+from lightpage.calibration.goodness.measure import ShownPage, measure_goodness
 from lightpage.calibration.goodness.verdict import Goodness
 from lightpage.calibration.parameters import NAMES
 from lightpage.calibration.waves.wave_fit import LevelPrior, WaveFit
@@ -58,7 +58,7 @@ def fitted_page(
 
 def goodness_of(*settings: str, wrong_symbols: float = 0.0, stated: float = 1.0) -> Goodness:
     """Return the goodness of such a calibration."""
-    return measure_goodness(TWIN, *fitted_page(*settings, wrong_symbols=wrong_symbols, stated=stated))
+    return measure_goodness(TWIN, [ShownPage(*fitted_page(*settings, wrong_symbols=wrong_symbols, stated=stated))])
 
 
 def true_variance(sensor: Sensor, expected: float, count: int = 100_000) -> float:

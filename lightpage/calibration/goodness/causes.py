@@ -1,0 +1,162 @@
+"""Split of what a fit leaves unexplained among causes for which there is a remedy.
+
+Each cause changes the equations of the cameras' counts by known columns, or at known places. The residual is split by
+matching pursuit: the cause that explains most of the power beyond that of noise is taken off, and the search begins
+again. Columns of the fitted parameters are taken off first, since a new fit would explain their part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from lightpage.calibration.goodness.camera_faults import CONTRAST
+from lightpage.calibration.goodness.light import PageLight, places_on_facet, radius2
+from lightpage.calibration.goodness.remedies import NEIGHBOURS
+from lightpage.calibration.parameters import NAMES, PRIORS, indices
+
+Real = NDArray[np.float64]
+Complex = NDArray[np.complexfloating]
+
+_BENDS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
+"""Powers of (x, y) of phases over the page."""
+_STEPS = (1e-4, -5e-4, 5e-4, -2e-3, 2e-3)
+"""Changes of the pipe's widths. The light bends away from its tangent at some of them."""
+_RANK = 1e-4
+"""Singular values are dropped below this share of the largest."""
+_LEAST_SHARE = 0.01
+"""Least share of a residual's power that a cause explains to be named."""
+_CHANCE = 4.0
+"""Least ratio of the power that a cause explains to the power of noise that its columns explain by chance."""
+_MOST_CAUSES = 6
+"""Largest number of causes that are taken off."""
+_UNLIKELY = 8.0
+"""Least deviation of a length that shows another device than the profile's, in standard deviations of the prior."""
+
+
+def unlike_profile(parameters: Real) -> str:
+    """Name the length of a fitted device [P] that shows that its profile is another device's, in words; empty if none.
+
+    Light that such a fit explains may be read all the same.
+    """
+    off = {index: abs(parameters[index]) / PRIORS[index] for index in indices("lengths")}
+    furthest = max(off, key=lambda index: off[index])
+    if off[furthest] < _UNLIKELY:
+        return ""
+    name = NAMES[furthest].removesuffix("_relative").replace("_", " ")
+    return f"a {name} {parameters[furthest]:+.1%} off the profile's: is this the device's profile?"
+
+
+def shares_of(
+    light: PageLight, noise: Real, known: Complex, places: Mapping[str, NDArray[np.bool_]]
+) -> dict[str, float]:
+    """Split the unexplained power of a page's equations among causes.
+
+    Args:
+        light: light of a known page, after its corrections.
+        noise: noise of the equations, as drawn from that of frames and modulator, [N].
+        known: relative errors of the modulator's samples that are explained already, [ny samples, nx samples].
+        places: equations that each local cause spoils, by its name, [N] each.
+
+    Returns:
+        Share of the power beyond that of noise that each cause explains, by name, the largest first.
+    """
+    fitted = scipy.linalg.orth(_of_unit_length(list(light.equations_of_fit())), rcond=_RANK)
+    explained = light.equations_of(light.waves.to_cameras(known * light.page)[:, *light.every])
+    residual = _orthogonal_part(fitted, light.equation_residual - explained)
+    chance = _orthogonal_part(fitted, noise)
+    power = float(residual @ residual)
+    excess = power - float(chance @ chance)
+    bases = {name: _orthonormal(fitted, columns) for name, columns in _suspects(light)}
+    local = {name: where for name, where in places.items() if where.any() and not where.all()}
+    shares: dict[str, float] = {}
+    while len(shares) < _MOST_CAUSES:
+        gains = {name: _gain(basis, residual, chance) for name, basis in bases.items()}
+        gains |= {name: _local_gain(where, residual) for name, where in local.items()}
+        best = max(gains, key=lambda name: gains[name], default="")
+        if not best or gains[best] < _LEAST_SHARE * power:
+            break
+        shares[best] = gains[best]
+        if best in local:
+            where = local.pop(best)
+            residual = np.where(where, 0, residual)
+            chance = np.where(where, 0, chance)
+            bases = {name: basis * ~where[:, None] for name, basis in bases.items()}
+            bases = {name: _orthonormal(fitted[:, :0], list(basis.T)) for name, basis in bases.items()}
+        else:
+            basis = bases.pop(best)
+            residual = _orthogonal_part(basis, residual)
+            chance = _orthogonal_part(basis, chance)
+            bases = {name: _orthonormal(basis, list(other.T)) for name, other in bases.items()}
+    total = max(excess, sum(shares.values()))  # the noise of the modulator may be estimated too high
+    return {name: gain / total for name, gain in shares.items()}
+
+
+def _gain(basis: Real, residual: Real, chance: Real) -> float:
+    """Power of a residual that a basis explains beyond that of chance; 0 where chance explains about as much."""
+    explained = float(np.sum((basis.T @ residual) ** 2))
+    by_chance = float(np.sum((basis.T @ chance) ** 2))
+    return explained - by_chance if explained > _CHANCE * by_chance else 0.0
+
+
+def _local_gain(where: NDArray[np.bool_], residual: Real) -> float:
+    """Power of a residual at some equations beyond that of as many others."""
+    return float(np.sum(residual[where] ** 2) - np.mean(residual[~where] ** 2) * np.count_nonzero(where))
+
+
+def _orthonormal(fitted: Real, columns: list[Real]) -> Real:
+    """Orthonormal basis of the part of columns that is orthogonal to `fitted`, whose columns are orthonormal."""
+    matrix = _of_unit_length(columns)
+    beyond = matrix - fitted @ (fitted.T @ matrix)
+    return np.asarray(scipy.linalg.orth(beyond, rcond=_RANK)) if np.linalg.norm(beyond) > _RANK else beyond[:, :0]
+
+
+def _of_unit_length(columns: list[Real]) -> Real:
+    """Matrix of the columns that are not zero, each divided by its length."""
+    lengths = [float(np.linalg.norm(column)) for column in columns]
+    units = [column / length for column, length in zip(columns, lengths, strict=True) if length > 0]
+    return np.stack(units, axis=1) if units else np.zeros((len(columns[0]) if columns else 0, 0))
+
+
+def _orthogonal_part(fitted: Real, column: Real) -> Real:
+    """Part of a column that is orthogonal to `fitted`, whose columns are orthonormal."""
+    return np.asarray(column - fitted @ (fitted.T @ column))
+
+
+def _suspects(light: PageLight) -> Iterator[tuple[str, list[Real]]]:
+    """Yield each possible cause with the columns by which it would change the equations."""
+    coarse, page = light.coarse, light.page
+    leaving, (across, up), squares = coarse.to_exit(page), places_on_facet(coarse), radius2(coarse)
+    one = np.array([1, 0])[:, None, None]
+
+    def at_exit(factor: Real) -> list[Real]:
+        """A phase over the exit facet, seen by either camera alone."""
+        change = coarse.from_exit(1j * leaving * factor)
+        return [light.equations_of(change * chosen) for chosen in (one, 1 - one)]
+
+    yield "camera focus", at_exit(squares)
+    yield "image moved", [*at_exit(across), *at_exit(up)]
+    yield "lens askew", [*at_exit(across**2 - up**2), *at_exit(across * up)]
+    entering = coarse.from_exit(coarse.to_exit(page, 1j * squares))
+    yield "modulator focus", [light.equations_of(entering)]
+    x, y = light.waves.x[None, :], light.waves.y[:, None]
+    bent = [light.equations_of(coarse.to_cameras(1j * page * x**i * y**j)) for i, j in _BENDS]
+    yield "modulator bent", bent
+    here = coarse.from_exit(leaving)
+    curved = coarse.from_exit(1j * leaving * squares)
+    tilted = [curved * place * chosen for place in light.coarse_places for chosen in (one, 1 - one)]
+    yield "camera tilt", [*map(light.equations_of, tilted)]
+    leaned = [coarse.from_exit(coarse.to_exit(np.asarray(page * place), 1j * squares)) for place in (x, y)]
+    yield "modulator tilt", [*map(light.equations_of, leaned)]
+    for name, width in (("walls", "pipe_height_relative"), ("taper", "pipe_taper")):
+        changed = [light.changed(None, None, **{width: step}).to_cameras(page) - here for step in _STEPS]
+        yield name, [*map(light.equations_of, changed)]
+    length = light.waves.channel.geometry.pipe_length_m
+    ghost = light.changed(pipe_length_m=3 * length).to_cameras(page)
+    yield "ghost", [light.equations_of(each) for each in (ghost, 1j * ghost)]
+    mixed = [factor * page * step**power for power, factor in ((1, 1j), (2, 1)) for step in light.steps]
+    yield NEIGHBOURS, [light.equations_of(light.waves.to_cameras(each)[:, *light.every]) for each in mixed]
+    yield CONTRAST, light.equations_of_contrast()
