@@ -348,7 +348,7 @@ class ForeignDevice:
         """Return this device with a share of the usual size of each fault of pipe, planes, modulator and cameras."""
         p = self.parameters
         sine = self.design.pipe_width / 2 / self.design.focal_length
-        mm = share / (WAVENUMBER * (1 - np.sqrt(1 - sine**2)))  # a share of a radian at the middle of the facet's wall
+        mm = share / float(WAVENUMBER * (1 - np.sqrt(1 - sine**2)))  # times a radian at the middle of the facet's wall
         return self.with_parameters(
             wall_y_error=0.001 * share,
             taper=0.0005 * share,
@@ -739,7 +739,7 @@ def odd_extension(facet: ComplexArray) -> ComplexArray:
 
 
 def unfolded(facet: ComplexArray, reach: tuple[float, float]) -> ComplexArray:
-    """Put a facet into the first cell of a periodic grid so large that light of this reach, in cells, never overlaps."""
+    """Put a facet into the first cell of a periodic grid in which light of this reach, in cells, never overlaps."""
     light = facet.copy()
     light[0], light[:, 0] = 0, 0  # walls
     return np.pad(light, [(0, (2 * int(np.ceil(r)) - 1) * n) for n, r in zip(facet.shape, reach, strict=True)])
