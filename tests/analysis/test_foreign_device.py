@@ -109,6 +109,15 @@ def test_a_taper_is_nothing_to_light_that_meets_no_wall() -> None:
     assert np.linalg.norm(leaving - free) < 1e-3 * np.linalg.norm(free)
 
 
+def test_a_mode_has_the_wave_number_of_either_pair_of_walls() -> None:
+    unequal = ForeignDevice(Parameters(wall_y_error=0.01), HALF).pipe
+    waves = np.array([20, 7]) * np.pi / np.array([1.01 * WIDTH, WIDTH])
+    y, x = (each + width / 2 for each, width in zip(unequal.entrance.coordinates, unequal.widths, strict=True))
+    mode = np.outer(np.sin(waves[0] * y), np.sin(waves[1] * x))
+    turned = np.exp(1j * LENGTH * (np.sqrt(K_GLASS**2 - waves @ waves) - K_GLASS))
+    assert unequal.through(mode) == pytest.approx(turned * mode, abs=1e-9)
+
+
 def test_pipe_keeps_the_power_between_unequal_walls_and_a_ghost_has_the_square_of_its_amplitude(
     page: np.ndarray,
 ) -> None:
