@@ -10,7 +10,7 @@ project is imported.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -153,10 +153,32 @@ class Parameters:
     piston_drift_rad: float = 0.0
     shift_drift_px: float = 0.0
     """Standard deviations of the steps of two random walks from page to page; the shift is in camera pixels."""
+    wall_y_error: float = 0.0
+    """Excess of the distance of the oblique walls over that of the x walls, relative."""
+    taper: float = 0.0
+    """Growth of both distances from entrance to exit, relative; their means stay."""
+    ghost: float = 0.0
+    """Amplitude of the light that both facets reflect once, and that passes the pipe three times."""
+    polarisation_rad: float = 0.0
+    """Phase that a reflection at an x wall adds and one at an oblique wall subtracts.
+
+    Light is polarised along x: p at x walls, s at oblique ones.
+    """
+    hot_pixels: float = 0.0
+    """Share of a camera's pixels that always show full scale."""
+    dust: int = 0
+    """Number of specks on each camera."""
+    dust_on_references: bool = True
+    """Whether the dust was there when the references were taken."""
+    blemish_seed: int = 0
+    """Seed of the places of hot pixels and dust."""
 
 
 def draw_parameters(rng: np.random.Generator) -> Parameters:
-    """Draw a device uniformly from the whole range from which calibration must succeed; Q's sign is a coin's."""
+    """Draw a device uniformly from the whole range from which calibration must succeed; Q's sign is a coin's.
+
+    Faults that came later, from `wall_y_error` on, stay off: seeds give the devices that they always gave.
+    """
 
     def within(limit: float) -> float:
         return float(rng.uniform(-limit, limit))
@@ -207,6 +229,106 @@ class PageDrift:
 
 
 @dataclass(frozen=True)
+class Facet:
+    """An end of the pipe, with its samples.
+
+    Attributes:
+        widths: distances of the oblique and of the x walls, mm.
+        samples: from wall to wall in (y', x).
+        angle: of the pipe, radians.
+        scale: widths over the mean widths of the pipe.
+    """
+
+    widths: tuple[float, float]
+    samples: tuple[int, int]
+    angle: float
+    scale: float = 1.0
+
+    @property
+    def pitches(self) -> tuple[float, float]:
+        """Sample pitches (y', x), mm."""
+        return self.widths[0] / self.samples[0], self.widths[1] / self.samples[1]
+
+    @cached_property
+    def coordinates(self) -> tuple[FloatArray, FloatArray]:
+        """(y', x) of the samples, mm; the first sample of each lies on a wall."""
+        return tuple(
+            np.arange(n) * d - width / 2 for n, d, width in zip(self.samples, self.pitches, self.widths, strict=True)
+        )  # type: ignore[return-value]
+
+    @cached_property
+    def points(self) -> tuple[FloatArray, FloatArray]:
+        """(x, y) of the samples along the axes of the page's rows and columns before its roll, [y', x], mm."""
+        oblique, across = self.coordinates
+        y = (oblique[:, None] - across[None, :] * np.sin(self.angle)) / np.cos(self.angle)
+        return np.broadcast_to(across, y.shape), y
+
+    def power(self, field: ComplexArray) -> float:
+        """Return the power of a field [y', x] on the facet."""
+        return float(np.sum(np.abs(field) ** 2) * np.prod(self.pitches) / np.cos(self.angle))
+
+
+@dataclass(frozen=True)
+class Pipe:
+    """A rhombic pipe.
+
+    Attributes:
+        widths: mean distances of the oblique and of the x walls, mm.
+        length: mm.
+        angle: radians.
+        samples: from wall to wall in (y', x).
+        steps: of the computation.
+        taper, ghost, polarisation: see `Parameters`.
+    """
+
+    widths: tuple[float, float]
+    length: float
+    angle: float
+    samples: tuple[int, int]
+    steps: int
+    taper: float = 0.0
+    ghost: float = 0.0
+    polarisation: float = 0.0
+
+    @cached_property
+    def entrance(self) -> Facet:
+        """Facet where light enters."""
+        return self._end(2 / (2 + self.taper))
+
+    @cached_property
+    def exit(self) -> Facet:
+        """Facet where light leaves."""
+        return self._end((1 + self.taper) * 2 / (2 + self.taper))
+
+    def _end(self, scale: float) -> Facet:
+        return Facet((scale * self.widths[0], scale * self.widths[1]), self.samples, self.angle, scale)
+
+    def through(self, field: ComplexArray) -> ComplexArray:
+        """Return the field at the exit of the light at the entrance, the ghost included.
+
+        The ghost is coherent: its way is longer by twice the length of the pipe.
+        """
+        field = self.one_pass(field, self.entrance, self.exit)
+        if self.ghost:
+            again = self.one_pass(self.one_pass(field, self.exit, self.entrance), self.entrance, self.exit)
+            field = field + self.ghost * np.exp(2j * GLASS_INDEX * WAVENUMBER * self.length) * again
+        return field
+
+    def one_pass(self, field: ComplexArray, start: Facet, end: Facet) -> ComplexArray:
+        """Return the field at `end` of the light that starts at `start`.
+
+        A tapered pipe is straight in coordinates that grow with its walls. The paraxial wave equation keeps its form if
+        the curvature of a wave that spreads with the walls is taken off the field, and dz becomes dz / scale^2.
+        """
+        growth = (end.scale - start.scale) / self.length
+        if growth:
+            field = field * spreading(start, -growth)
+        scaled = self.length / (start.scale * end.scale)
+        field = propagate_pipe(field, self.widths, scaled, self.angle, self.steps, self.polarisation)
+        return field * (start.scale / end.scale) * spreading(end, growth) if growth else field
+
+
+@dataclass(frozen=True)
 class ForeignDevice:
     """A device with its optics, cameras and noise."""
 
@@ -222,6 +344,25 @@ class ForeignDevice:
         """Return this device with some parameters changed."""
         return dataclasses.replace(self, parameters=dataclasses.replace(self.parameters, **changes))  # type: ignore[arg-type]
 
+    def with_faults(self, share: float) -> ForeignDevice:
+        """Return this device with a share of the usual size of each fault of pipe, planes, modulator and cameras."""
+        p = self.parameters
+        sine = self.design.pipe_width / 2 / self.design.focal_length
+        mm = share / float(WAVENUMBER * (1 - np.sqrt(1 - sine**2)))  # times a radian at the middle of the facet's wall
+        return self.with_parameters(
+            wall_y_error=0.001 * share,
+            taper=0.0005 * share,
+            ghost=0.03 * share,
+            polarisation_rad=0.1 * share,
+            modulator_behind_mm=1.2 * mm,
+            in_phase_camera=dataclasses.replace(p.in_phase_camera, behind_mm=0.8 * mm),
+            quadrature_camera=dataclasses.replace(p.quadrature_camera, behind_mm=-0.7 * mm),
+            level_sine_rad=0.15 * share,
+            stroke_error=-0.015 * share,
+            hot_pixels=5e-5 * share,
+            dust=round(6 * share),
+        )
+
     # --- geometry -----------------------------------------------------------------------------------------------------
 
     @property
@@ -234,34 +375,21 @@ class ForeignDevice:
         """True focal length of both lenses, mm."""
         return self.design.focal_length * (1 + self.parameters.focal_length_error)
 
-    @property
-    def pipe_length(self) -> float:
-        """True length of the pipe, mm."""
-        return self.design.pipe_length * (1 + self.parameters.pipe_length_error)
-
-    @property
-    def pipe_width(self) -> float:
-        """True distance of opposite walls, mm."""
-        return self.design.pipe_width * (1 + self.parameters.pipe_width_error)
-
-    @property
-    def pitches(self) -> tuple[float, float]:
-        """Sample pitches (y', x) on the facet, mm."""
-        return self.pipe_width / self.design.facet[0], self.pipe_width / self.design.facet[1]
-
     @cached_property
-    def facet_coordinates(self) -> tuple[FloatArray, FloatArray]:
-        """(y', x) of the facet's samples, mm; the first sample of each lies on a wall."""
-        return tuple(
-            np.arange(n) * d - self.pipe_width / 2 for n, d in zip(self.design.facet, self.pitches, strict=True)
-        )  # type: ignore[return-value]
-
-    @cached_property
-    def facet_points(self) -> tuple[FloatArray, FloatArray]:
-        """(x, y) of the facet's samples along the axes of the page's rows and columns before its roll, [y', x], mm."""
-        facet_y, facet_x = self.facet_coordinates
-        y = (facet_y[:, None] - facet_x[None, :] * np.sin(self.angle)) / np.cos(self.angle)
-        return np.broadcast_to(facet_x, y.shape), y
+    def pipe(self) -> Pipe:
+        """The true pipe."""
+        p, design = self.parameters, self.design
+        width = design.pipe_width * (1 + p.pipe_width_error)
+        return Pipe(
+            widths=(width * (1 + p.wall_y_error), width),
+            length=design.pipe_length * (1 + p.pipe_length_error),
+            angle=self.angle,
+            samples=design.facet,
+            steps=design.steps,
+            taper=p.taper,
+            ghost=p.ghost,
+            polarisation=p.polarisation_rad,
+        )
 
     # --- light --------------------------------------------------------------------------------------------------------
 
@@ -293,8 +421,8 @@ class ForeignDevice:
         y0, x0 = (
             float(c) - (n - 1) / 2 * SLM_PITCH for c, n in zip((centre_y, centre_x), self.design.padded_px, strict=True)
         )
-        facet_y, facet_x = self.facet_coordinates
-        dy, dx = self.pitches
+        entrance = self.pipe.entrance
+        (facet_y, facet_x), (dy, dx) = entrance.coordinates, entrance.pitches
         tangent, cosine = np.tan(self.angle), np.cos(self.angle)
         field = fourier_sum(turned, (x0, SLM_PITCH), (facet_x[0], dx, self.design.facet[1]), -WAVENUMBER / f, axis=1)
         page_y = y0 + np.arange(self.design.padded_px[0]) * SLM_PITCH
@@ -302,20 +430,20 @@ class ForeignDevice:
         field = fourier_sum(
             field, (y0, SLM_PITCH), (facet_y[0], dy, self.design.facet[0]), -WAVENUMBER / (f * cosine), axis=0
         )
-        x, y = self.facet_points
+        x, y = entrance.points
         # Cycles a pixel along the SLM's own axes: they set what a square pixel and the blur let through.
         u, v = (c * SLM_PITCH / (WAVELENGTH * f) for c in rotate(x, y, roll))
         field *= np.sinc(u) * np.sinc(v) * np.exp(-2 * (np.pi * self.parameters.blur_px) ** 2 * (u**2 + v**2))
         return (
             field
-            * out_of_focus(self.facet_points, f, self.parameters.modulator_behind_mm)
+            * out_of_focus(entrance.points, f, self.parameters.modulator_behind_mm)
             * SLM_PITCH**2
             / (WAVELENGTH * f)
         )
 
     def delaunch(self, facet: ComplexArray) -> Image:
         """Return the field on the camera plane of that on the exit facet, in the pipe's axes."""
-        f, (facet_y, facet_x), (dy, dx) = self.focal_length, self.facet_coordinates, self.pitches
+        f, (facet_y, facet_x), (dy, dx) = self.focal_length, self.pipe.exit.coordinates, self.pipe.exit.pitches
         counts = [
             int(np.ceil((n * CAMERA_PITCH / 2 + IMAGE_MARGIN) / IMAGE_PITCH)) * 2 + 1 for n in self.design.frame_shape
         ]
@@ -330,11 +458,10 @@ class ForeignDevice:
 
     def images(self, symbols: NDArray[np.integer], levels: int, rng: np.random.Generator) -> list[Image]:
         """The whole way of one page's light, from symbols to the planes of the in-phase and the quadrature camera."""
-        facet = self.launch(self.modulate(symbols, levels, rng))
-        leaving = propagate_pipe(facet, self.pipe_width, self.pipe_length, self.angle, self.design.steps)
+        leaving = self.pipe.through(self.launch(self.modulate(symbols, levels, rng)))
         behind = [camera.behind_mm for camera in (self.parameters.in_phase_camera, self.parameters.quadrature_camera)]
         made = {
-            distance: self.delaunch(leaving * out_of_focus(self.facet_points, self.focal_length, distance))
+            distance: self.delaunch(leaving * out_of_focus(self.pipe.exit.points, self.focal_length, distance))
             for distance in behind
         }
         return [made[distance] for distance in behind]
@@ -346,7 +473,7 @@ class ForeignDevice:
         """Root mean square amplitude of the signal over the page's image: pipe and lenses keep the power."""
         rng = np.random.default_rng(0)
         facet = self.launch(self.modulate(rng.integers(0, 256, self.design.page_shape), 256, rng))
-        power = np.sum(np.abs(facet) ** 2) * np.prod(self.pitches) / np.cos(self.angle)
+        power = self.pipe.entrance.power(facet)
         return float(np.sqrt(power / (np.prod(self.design.page_px) * SLM_PITCH**2)))
 
     def signal(self, image: Image, camera: Camera, drift: PageDrift) -> ComplexArray:
@@ -410,8 +537,21 @@ class ForeignDevice:
             field = self.reference(camera) * np.exp(1j * phase)
             if images:
                 field += self.signal(images[number], camera, drift)
-            result.append(gain * (field.real**2 + field.imag**2))
+            light = gain * (field.real**2 + field.imag**2)
+            if p.dust and (images or p.dust_on_references):
+                light = light * behind_dust(p, number, self.design.frame_shape)
+            result.append(light)
         return result[0], result[1]
+
+    def frames(
+        self, images: list[Image], rng: np.random.Generator, drift: PageDrift = PageDrift(), exposures: int = 1
+    ) -> Iterator[NDArray[np.unsignedinteger]]:
+        """Yield the frame of each camera: see `intensities` and `expose`."""
+        for number, intensity in enumerate(self.intensities(images, drift)):
+            counts = self.expose(intensity, rng, exposures)
+            if self.parameters.hot_pixels:
+                counts.flat[hot_pixels(self.parameters, number, counts.size)] = 2**self.parameters.bit_depth - 1
+            yield counts
 
     # --- recordings ---------------------------------------------------------------------------------------------------
 
@@ -453,15 +593,15 @@ class ForeignDevice:
                 file["pilots"] = pilots
             names = ("in_phase", "quadrature")
             dtype = np.uint8 if self.parameters.bit_depth == 8 else np.uint16
-            for name, intensity in zip(names, self.intensities([]), strict=True):
-                file[f"reference_{name}"] = self.expose(intensity, rng, REFERENCE_EXPOSURES)
+            for name, frame in zip(names, self.frames([], rng, exposures=REFERENCE_EXPOSURES), strict=True):
+                file[f"reference_{name}"] = frame
                 file.create_dataset(
                     name, (pages, *self.design.frame_shape), dtype, chunks=(1, *self.design.frame_shape)
                 )
             for page in range(pages):
                 images = self.images(symbols[page], levels, rng)
-                for name, intensity in zip(names, self.intensities(images, drifts[page]), strict=True):
-                    file[name][page] = self.expose(intensity, rng)
+                for name, frame in zip(names, self.frames(images, rng, drifts[page]), strict=True):
+                    file[name][page] = frame
         return symbols
 
 
@@ -480,6 +620,31 @@ def out_of_focus(points: tuple[FloatArray, FloatArray], focal_length: float, dis
     """Return the factors by which a defocus of `distance` mm changes the field at points (x, y) mm of a facet."""
     sine2 = (points[0] ** 2 + points[1] ** 2) / focal_length**2
     return np.asarray(np.exp(1j * WAVENUMBER * distance * (np.sqrt(1 - sine2) - 1)))
+
+
+def spreading(end: Facet, growth: float) -> ComplexArray:
+    """Return the factors of a wave in glass that spreads as walls do whose scale grows by `growth` a millimetre."""
+    x, y = end.points
+    return np.asarray(np.exp(0.5j * GLASS_INDEX * WAVENUMBER * growth / end.scale * (x**2 + y**2)))
+
+
+def hot_pixels(p: Parameters, camera: int, pixels: int) -> NDArray[np.integer]:
+    """Return the numbers of a camera's hot pixels."""
+    rng = np.random.default_rng([p.blemish_seed, camera])
+    return rng.choice(pixels, round(p.hot_pixels * pixels), replace=False)
+
+
+def behind_dust(p: Parameters, camera: int, shape: tuple[int, int]) -> FloatArray:
+    """Return the share of the light that a camera's dust lets through: 0.3 to 0.7 in discs of 1.5 to 6 pixels."""
+    rng = np.random.default_rng([p.blemish_seed, camera, 1])
+    rows, columns = np.ogrid[: shape[0], : shape[1]]
+    passed = np.ones(shape)
+    for _ in range(p.dust):
+        row, column = rng.uniform(0, shape[0]), rng.uniform(0, shape[1])
+        radius, transmission = rng.uniform(1.5, 6.0), rng.uniform(0.3, 0.7)
+        covered = np.clip(radius + 0.5 - np.hypot(rows - row, columns - column), 0, 1)
+        passed *= 1 - (1 - transmission) * covered
+    return passed
 
 
 def walk(
@@ -573,31 +738,79 @@ def odd_extension(facet: ComplexArray) -> ComplexArray:
     return facet
 
 
-def propagate_pipe(facet: ComplexArray, width: float, length: float, angle: float, steps: int) -> ComplexArray:
+def unfolded(facet: ComplexArray, reach: tuple[float, float]) -> ComplexArray:
+    """Put a facet into the first cell of a periodic grid in which light of this reach, in cells, never overlaps."""
+    light = facet.copy()
+    light[0], light[:, 0] = 0, 0  # walls
+    return np.pad(light, [(0, (2 * int(np.ceil(r)) - 1) * n) for n, r in zip(facet.shape, reach, strict=True)])
+
+
+def folded(light: ComplexArray, shape: tuple[int, int], polarisation: float) -> ComplexArray:
+    """Fold unfolded cells onto the first; each fold is a reflection, with a change of sign and its phase."""
+    for axis, phase in ((0, -polarisation), (1, polarisation)):
+        n, total = shape[axis], light.shape[axis]
+        cells = total // n
+        inside = np.arange(n)
+        # Cells of the second half are those of light that goes the other way.
+        light = sum(
+            (-np.exp(1j * phase)) ** min(cell, cells - cell)
+            * np.take(light, cell * n + inside if cell % 2 == 0 else ((cell + 1) * n - inside) % total, axis=axis)
+            for cell in range(cells)
+        )
+    return light
+
+
+def propagate_pipe(
+    facet: ComplexArray,
+    widths: tuple[float, float],
+    length: float,
+    angle: float,
+    steps: int,
+    polarisation: float = 0.0,
+) -> ComplexArray:
     """Propagate a facet field [y', x] through a rhombic pipe whose walls reflect with a change of sign.
 
     In the oblique coordinates (x, y') the transverse Laplacian is d_x^2 + d_y'^2 + 2 sin(angle) d_x d_y'. The first two
     terms are exact in the extension's Fourier space. The last changes its sign from cell to cell; it goes between half
     steps of the others, as an exponential series of P (s d_x d_y') P, s the sign of the cell and P = kz^(-1/2), which
     is the first-order term of the square root and keeps the power. Phases are relative to the glass wave number.
+
+    Walls that change the phase too, by `polarisation` at x walls and its negative at oblique ones, are unfolded: light
+    starts in one cell, and its cell at the end tells how often either pair has reflected it. That is exact where the
+    phase does not depend on the angle of incidence, but for light that the pipe's edges scatter.
     """
     rows, columns = facet.shape
     k_glass = GLASS_INDEX * WAVENUMBER
-    ky, kx = np.meshgrid(*(np.pi / width * n * scipy.fft.fftfreq(2 * n) * 2 for n in facet.shape), indexing="ij")
+    bands = [np.pi / width * n for n, width in zip(facet.shape, widths, strict=True)]
+    if polarisation:
+        reach_y, reach_x = (length * k / k_glass / width for k, width in zip(bands, widths, strict=True))
+        extended = unfolded(facet, (reach_y, reach_x))
+    else:
+        extended = odd_extension(facet)
+
+    def at_exit(spectrum: ComplexArray) -> ComplexArray:
+        light = scipy.fft.ifft2(spectrum, workers=2)
+        return np.asarray(folded(light, (rows, columns), polarisation) if polarisation else light[:rows, :columns])
+
+    ky, kx = np.meshgrid(
+        *(k * scipy.fft.fftfreq(n) * 2 for n, k in zip(extended.shape, bands, strict=True)), indexing="ij"
+    )
     kz = np.sqrt(k_glass**2 - kx**2 - ky**2)
     # kz - nk without cancellation, so that single precision serves afterwards.
     relative = -(kx**2 + ky**2) / (kz + k_glass)
-    spectrum = scipy.fft.fft2(odd_extension(facet), workers=2)
+    spectrum = scipy.fft.fft2(extended, workers=2)
     if angle == 0:
-        return np.asarray(scipy.fft.ifft2(spectrum * np.exp(1j * relative * length), workers=2)[:rows, :columns])
+        return at_exit(spectrum * np.exp(1j * relative * length))
     dz = length / steps
     half = np.exp(0.5j * relative * dz).astype(np.complex64)
     whole = np.exp(1j * relative * dz).astype(np.complex64)
     root = (kz / k_glass) ** -0.5
     cross = (-np.sin(angle) * dz / k_glass * kx * ky * root).astype(np.float32)
+    if polarisation:  # the highest frequency of an even count has no sign; an odd extension has no such light
+        cross[extended.shape[0] // 2], cross[:, extended.shape[1] // 2] = 0, 0
     signs = [
         np.sign(np.where(i == 0, 0, np.where(i == n, 0, n - i)))
-        for i, n in ((np.arange(2 * n), n) for n in facet.shape)
+        for i, n in ((np.arange(total) % (2 * n), n) for total, n in zip(extended.shape, facet.shape, strict=True))
     ]
     cells = np.outer(*signs).astype(np.float32)
     root = root.astype(np.float32)
@@ -611,4 +824,4 @@ def propagate_pipe(facet: ComplexArray, width: float, length: float, angle: floa
             term *= root * np.complex64(1j / order)
             spectrum = spectrum + term
         spectrum *= whole if step < steps - 1 else half
-    return np.asarray(scipy.fft.ifft2(spectrum, workers=2)[:rows, :columns])
+    return at_exit(spectrum)
