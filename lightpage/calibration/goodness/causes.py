@@ -14,6 +14,7 @@ import scipy
 from numpy.typing import NDArray
 
 from lightpage.calibration.goodness.camera_faults import CONTRAST
+from lightpage.calibration.goodness.equations import coarse_places, equations_of_contrast, equations_of_fit
 from lightpage.calibration.goodness.light import PageLight, places_on_facet, radius2
 from lightpage.calibration.goodness.remedies import NEIGHBOURS
 from lightpage.calibration.parameters import NAMES, PRIORS, indices
@@ -64,7 +65,7 @@ def shares_of(
     Returns:
         Share of the power beyond that of noise that each cause explains, by name, the largest first.
     """
-    fitted = scipy.linalg.orth(_of_unit_length(list(light.equations_of_fit())), rcond=_RANK)
+    fitted = scipy.linalg.orth(_of_unit_length(list(equations_of_fit(light))), rcond=_RANK)
     explained = light.equations_of(light.waves.to_cameras(known * light.page)[:, *light.every])
     residual = _orthogonal_part(fitted, light.equation_residual - explained)
     chance = _orthogonal_part(fitted, noise)
@@ -147,7 +148,7 @@ def _suspects(light: PageLight) -> Iterator[tuple[str, list[Real]]]:
     yield "modulator bent", bent
     here = coarse.from_exit(leaving)
     curved = coarse.from_exit(1j * leaving * squares)
-    tilted = [curved * place * chosen for place in light.coarse_places for chosen in (one, 1 - one)]
+    tilted = [curved * place * chosen for place in coarse_places(light) for chosen in (one, 1 - one)]
     yield "camera tilt", [*map(light.equations_of, tilted)]
     leaned = [coarse.from_exit(coarse.to_exit(np.asarray(page * place), 1j * squares)) for place in (x, y)]
     yield "modulator tilt", [*map(light.equations_of, leaned)]
@@ -159,4 +160,4 @@ def _suspects(light: PageLight) -> Iterator[tuple[str, list[Real]]]:
     yield "ghost", [light.equations_of(each) for each in (ghost, 1j * ghost)]
     mixed = [factor * page * step**power for power, factor in ((1, 1j), (2, 1)) for step in light.steps]
     yield NEIGHBOURS, [light.equations_of(light.waves.to_cameras(each)[:, *light.every]) for each in mixed]
-    yield CONTRAST, light.equations_of_contrast()
+    yield CONTRAST, equations_of_contrast(light)

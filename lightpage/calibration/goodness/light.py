@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.goodness.frame_noise import CountCurve, noise_like, on_pixels
 from lightpage.calibration.interfaces import Twin
-from lightpage.calibration.parameters import PARAMETERS, SEEN_BY_CAMERAS, STEPS
 from lightpage.calibration.samplers import smooth_reference
 from lightpage.calibration.waves.wave_fit import READ_NOISE
 from lightpage.calibration.waves.wave_model import FittedWaves, LaunchConditions, illumination_terms, on_modulator
@@ -42,6 +41,8 @@ class PageLight:
     Light of both cameras is on the common grid, [2, Gy, Gx].
 
     Attributes:
+        twin: ray tracer of the nominal device.
+        device: fitted device.
         waves: fitted waves.
         page: light on the modulator, [ny samples, nx samples].
         steps: second differences of the nominal phases of the samples along x, and along y, [2, ny samples,
@@ -51,6 +52,10 @@ class PageLight:
         references: counts of the references, [2, Gy, Gx].
         visible: places of the grid that both cameras see, [Gy, Gx].
         every: slices of the grid to the coarse grid.
+        stride: samples of the grid from one of the coarse grid to the next.
+        grid: the common grid.
+        at: rows and columns of both cameras' pixels at the places of the grid.
+        images: filtered differences of frames and references, [H, W] each.
         pair: frames of the page.
     """
 
@@ -63,13 +68,13 @@ class PageLight:
         symbols: NDArray[np.complex128],
     ) -> None:
         profile = device.profile
-        self._twin = twin
-        self._device = device
+        self.twin = twin
+        self.device = device
         self.pair = pair
         self._samples = symbol_samples(profile)
-        self._grid = field_grid(profile)
-        self._stride = max(_LEAST_STRIDE, int(np.sqrt(np.prod(self._grid.shape) / _EQUATIONS)))
-        self.every = (slice(None, None, self._stride), slice(None, None, self._stride))
+        self.grid = field_grid(profile)
+        self.stride = max(_LEAST_STRIDE, int(np.sqrt(np.prod(self.grid.shape) / _EQUATIONS)))
+        self.every = (slice(None, None, self.stride), slice(None, None, self.stride))
         self._blur = conditions.blur
         self.waves = FittedWaves(profile, device.parameters, self._samples, filled=True, blur=self._blur)
         self._terms = np.stack(illumination_terms(self.waves.x, self.waves.y))
@@ -77,16 +82,16 @@ class PageLight:
         self.page = on_modulator(device.modulation.page_light(np.angle(symbols)), self._samples) * illumination
         written = np.pad(np.mod(on_modulator(np.angle(symbols), self._samples).real, 2 * np.pi), 1, mode="edge")
         self.steps = np.stack([np.diff(written[1:-1], 2, axis=1), np.diff(written[:, 1:-1], 2, axis=0)])
-        places = np.stack(np.meshgrid(self._grid.x_m, self._grid.y_m), axis=-1).reshape(-1, 2)
-        pixels = twin.pixels(device.parameters, places).reshape(2, *self._grid.shape, 2)
-        edge = len(self._grid.prefilter)
+        places = np.stack(np.meshgrid(self.grid.x_m, self.grid.y_m), axis=-1).reshape(-1, 2)
+        pixels = twin.pixels(device.parameters, places).reshape(2, *self.grid.shape, 2)
+        edge = len(self.grid.prefilter)
         size = np.array(pair.in_phase.shape[::-1])
         self.visible = np.all((pixels > edge) & (pixels < size - edge), axis=(0, 3))
-        self._at = _rows_and_columns(pixels)
+        self.at = rows_and_columns(pixels)
         self._smooth_references = [
             smooth_reference(each) for each in (device.references.in_phase, device.references.quadrature)
         ]
-        self.references = _interpolated(self._smooth_references, self._at)
+        self.references = interpolated(self._smooth_references, self.at)
         amplitude = np.sqrt(self.references[0])
         self._amplitude = amplitude / amplitude[self.visible].mean()
         self._arms = np.exp(1j * np.array([0.0, device.quadrature_phase_rad]))[:, None, None]
@@ -95,8 +100,8 @@ class PageLight:
             pair.in_phase.astype(np.float32) - references.in_phase,
             pair.quadrature.astype(np.float32) - references.quadrature,
         ]
-        self._images = _filtered(differences, self._grid.prefilter)
-        self.counts = _interpolated(self._images, self._at) / (2 * self.references)
+        self.images = _filtered(differences, self.grid.prefilter)
+        self.counts = interpolated(self.images, self.at) / (2 * self.references)
         self.fields = self.waves.to_cameras(self.page)
         self._excess = np.zeros_like(self.counts)
         """Mean excess of the counts over the expected counts, see `correct_counts`."""
@@ -114,38 +119,27 @@ class PageLight:
         """Counts that the model predicts for both cameras' pixels, [H, W]; NaN beyond the common grid."""
         in_phase, quadrature = (
             on_pixels(brightness, at, level.shape) * level
-            for brightness, at, level in zip(self.brightness, self._at, self._smooth_references, strict=True)
+            for brightness, at, level in zip(self.brightness, self.at, self._smooth_references, strict=True)
         )
         return in_phase, quadrature
 
     def frame_noise(self) -> Complex:
         """Draw noise with the variance of the frames', and return it as light of both cameras."""
-        return self._explaining_light(self._drawn_counts)
-
-    def noise_equations(self, modulator_variance_rad2: float) -> Real:
-        """Draw noise of the equations on the coarse grid, over their noise, flat.
-
-        Args:
-            modulator_variance_rad2: variance of the modulator's phase, a sample.
-        """
-        deviation = np.sqrt(modulator_variance_rad2)
-        noise = deviation * np.random.default_rng(1).standard_normal(self.page.shape)
-        by_modulator = self.waves.to_cameras(1j * noise * self.page)[:, *self.every]
-        return self.equations(self._drawn_counts) + self.equations_of(by_modulator)
+        return self._explaining_light(self.drawn_counts)
 
     @cached_property
-    def _drawn_counts(self) -> Real:
+    def drawn_counts(self) -> Real:
         """Noise with the variance of the frames', over twice the references, [2, Gy, Gx]."""
         pair = self.pair
-        references = self._device.references
+        references = self.device.references
         frames = [pair.in_phase, references.in_phase, pair.quadrature, references.quadrature]
         in_phase, quadrature = self.expected_frames()
         expected = [in_phase, self._smooth_references[0], quadrature, self._smooth_references[1]]
         drawn = list(zip(frames, expected, np.random.default_rng(0).spawn(len(frames)), strict=True))
         noise = list(in_parallel(lambda one: noise_like(*one), drawn))
         differences = [noise[0] - noise[1], noise[2] - noise[3]]
-        images = _filtered(differences, self._grid.prefilter)
-        return _interpolated(images, self._at) / (2 * self.references)
+        images = _filtered(differences, self.grid.prefilter)
+        return interpolated(images, self.at) / (2 * self.references)
 
     def modulator_noise(self) -> Complex:
         """Draw phase noise of the modulator, 1 rad a sample, and return it as light of both cameras, to first order."""
@@ -154,7 +148,7 @@ class PageLight:
 
     def errors(self, leaving: Complex) -> Complex:
         """Project light on the exit facet to relative errors of the symbols, [ny, nx]."""
-        rows, columns = self._device.profile.page_shape
+        rows, columns = self.device.profile.page_shape
         blocks = (rows, self._samples, columns, self._samples)
         products = self.page.conj() * self.waves.back_to_page(leaving)
         power = np.abs(self.page) ** 2
@@ -208,61 +202,10 @@ class PageLight:
         """Change of the equations, flat, by a small change of both cameras' light on the coarse grid."""
         return self.equations((change / self._amplitude[self.every] * self._count_gradient(self.every).conj()).real)
 
-    def equations_of_fit(self) -> Iterator[Real]:
-        """Yield the change of the equations, flat, by a small change of each parameter that the twin knows."""
-        leaving = self.coarse.to_exit(self.page)
-        fields = self.coarse.from_exit(leaving)
-        places = np.stack(np.meshgrid(self._grid.x_m, self._grid.y_m), axis=-1)[self.every]
-        for index in range(min(self._twin.known, len(PARAMETERS))):
-            moved = self._device.parameters.copy()
-            moved[index] += STEPS[index]
-            if index in SEEN_BY_CAMERAS:
-                at = _rows_and_columns(self._twin.pixels(moved, places.reshape(-1, 2)).reshape(2, *places.shape))
-                yield self.equations(
-                    _interpolated(self._images, at) / (2 * self.references[:, *self.every])
-                    - self.counts[:, *self.every]
-                )
-            else:
-                changed = self.coarse.moved(index, self.changed(moved), self.page, leaving, fields)
-                yield self.equations_of(changed - fields)
-
     def interference_and_power(self) -> tuple[Real, Real]:
         """Interference and power of the predicted light, over the reference's power, [2, Gy, Gx] each."""
         field = self.fields / self._amplitude
         return np.asarray(2 * (field * self._arms.conj()).real), np.asarray(np.abs(field) ** 2)
-
-    def equations_of_contrast(self) -> list[Real]:
-        """Change of the equations, flat, by more signal with as much interference, and by more of both; each camera's.
-
-        The part that depends on the expected count alone is taken off, as `correct_counts` takes it off the residual.
-        """
-        interference, power = self.interference_and_power()
-        columns = []
-        for camera, (level, brightness) in enumerate(zip(self.references, self.brightness, strict=True)):
-            expected = level * brightness
-            for term in (power[camera] / 2, interference[camera] / 2 + power[camera]):
-                curve = CountCurve.measured(expected[self.visible], term[self.visible])
-                change = np.zeros_like(self.counts)
-                change[camera] = term - curve.at(expected)
-                columns.append(self.equations(change))
-        return columns
-
-    def equations_near(self, pixels: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Return which equations, flat, take in one of some pixels of either camera, [2, H, W]."""
-        reach = len(self._grid.prefilter) // 2 + 1
-        near = np.stack([scipy.ndimage.binary_dilation(each, iterations=reach) for each in pixels])
-        chosen = [
-            scipy.ndimage.map_coordinates(one.astype(np.uint8), at, order=0, mode="nearest")
-            for one, at in zip(near, self._at, strict=True)
-        ]
-        return np.asarray(np.stack(chosen)[:, *self.every][:, self.visible[self.every]].ravel() > 0)
-
-    @property
-    def coarse_places(self) -> tuple[Real, Real]:
-        """Coordinates x [1, nx] and y [ny, 1] of the coarse grid, over its half width and half height."""
-        x = self._grid.x_m[:: self._stride]
-        y = self._grid.y_m[:: self._stride]
-        return (x / self._grid.x_m[-1])[None, :], (y / self._grid.y_m[-1])[:, None]
 
     @property
     def brightness(self) -> Real:
@@ -281,10 +224,10 @@ class PageLight:
 
     def changed(self, parameters: Real | None = None, samples: int | None = None, **geometry: float) -> FittedWaves:
         """Fitted waves on the coarse grid, with other parameters, samples of a symbol, or geometry."""
-        parameters = self._device.parameters if parameters is None else parameters
-        coarse: dict[str, Any] = {"filled": True, "stride": self._stride, "accuracy": _ACCURACY}
+        parameters = self.device.parameters if parameters is None else parameters
+        coarse: dict[str, Any] = {"filled": True, "stride": self.stride, "accuracy": _ACCURACY}
         coarse |= {"changed": geometry, "blur": self._blur, "like": vars(self).get("coarse")}
-        return FittedWaves(self._device.profile, parameters, samples or self._samples, **coarse)
+        return FittedWaves(self.device.profile, parameters, samples or self._samples, **coarse)
 
     @property
     def count_residual(self) -> Real:
@@ -316,12 +259,12 @@ def radius2(waves: FittedWaves) -> Real:
     return np.asarray(waves.channel.facet_radius2_m2 / (waves.channel.geometry.pipe_width_m / 2) ** 2, np.float64)
 
 
-def _rows_and_columns(pixels: Real) -> list[list[Real]]:
+def rows_and_columns(pixels: Real) -> list[list[Real]]:
     """Rows and columns, as scipy takes them, of pixels (column, row) of both cameras, [2, ..., 2]."""
     return [[each[..., 1], each[..., 0]] for each in pixels]
 
 
-def _interpolated(images: Sequence[NDArray[np.float32]], at: Sequence[Sequence[Real]]) -> Real:
+def interpolated(images: Sequence[NDArray[np.float32]], at: Sequence[Sequence[Real]]) -> Real:
     """Interpolate each camera's image at its pixels (row, column)."""
     values = [
         scipy.ndimage.map_coordinates(one, pixels, order=1, mode="nearest")

@@ -27,6 +27,7 @@ from lightpage.calibration.goodness.camera_faults import (
     shadows,
 )
 from lightpage.calibration.goodness.causes import shares_of, unlike_profile
+from lightpage.calibration.goodness.equations import equations_near, noise_equations
 from lightpage.calibration.goodness.light import PageLight
 from lightpage.calibration.goodness.page_errors import (
     Explained,
@@ -252,10 +253,10 @@ def _causes(
     known = on_modulator(explained, light.waves.samples)
     rest = max(0.0, unexplained - dead.power)
     dark = np.stack([shadows(*_frames_of(every, camera)) for camera in range(2)])
-    places = {DUST: light.equations_near(dark)}
+    places = {DUST: equations_near(light, dark)}
     if gains is not None:
-        places[CAMERA_PIXELS] = light.equations_near(gains == 0)
-    noise = light.noise_equations(amount)
+        places[CAMERA_PIXELS] = equations_near(light, gains == 0)
+    noise = noise_equations(light, amount)
     shares = shares_of(light, noise, known, places)
     contrast = named_contrast(page.terms)
     for name, share in shares.items():

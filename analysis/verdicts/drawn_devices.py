@@ -1,11 +1,13 @@
 """Devices of the whole capture range, calibrated on two known pages and read by their fitted waves alone.
 
-    python -m analysis.comparison.drawn_devices --devices 20 --json F
-    python -m analysis.comparison.drawn_devices --devices 20 --set sensor.full_well_e=32 --json F
+    python -m analysis.verdicts.drawn_devices --devices 20 --json F
+    python -m analysis.verdicts.drawn_devices --devices 20 --set sensor.full_well_e=32 --json F
+    python -m analysis.verdicts.drawn_devices --devices 5 --foreign 0.33 --json F
 
 A device is drawn by each seed, as `analysis.calibration.devices` does, calibrated and exported. Further pages are read
 by the bundle's number of steps. Their AIR is compared with the bound of the light and, on pages that the export did not
-read, with the AIR of the verdict. An interrupted run continues: seeds in the JSON file are not computed again.
+read, with the AIR of the verdict. Devices of the other simulator, `--foreign`, have a share of its faults and no bound.
+An interrupted run continues: seeds in the JSON file are not computed again.
 """
 
 from __future__ import annotations
@@ -14,13 +16,15 @@ import sys
 import tempfile
 import time
 from dataclasses import asdict, dataclass
+from itertools import chain
 from pathlib import Path
 
 import click
 import numpy as np
 
 from analysis.calibration.devices import load
-from analysis.comparison.data_set import bundle_by_waves
+from analysis.comparison.data_set import CALIBRATED, bundle_by_waves
+from analysis.foreign_device import ForeignDevice
 from lightpage.cli.main import run
 from lightpage.cli.paths import OutputFile
 from lightpage.device.profile import Profile, load_profile
@@ -57,6 +61,7 @@ class Row:
         verdict_error_bits: that AIR minus the AIR of pages that the export did not read.
         light_bits: information of the light as the calibration states it.
         user_bytes: user bytes of a page by the code of two to six pages.
+        causes: names of the causes of what is lost with their bits, the largest first.
         seconds: time from the two known pages to the bundle.
         failure: error that ended calibration, export or reading.
     """
@@ -72,6 +77,7 @@ class Row:
     verdict_error_bits: float | None = None
     light_bits: float | None = None
     user_bytes: int | None = None
+    causes: dict[str, float] | None = None
     seconds: float | None = None
     failure: str | None = None
 
@@ -83,14 +89,19 @@ def _line(row: Row) -> str:
     if row.failure is not None:
         return f"{row.seed:>6} {row.failure}"
     values = (row.bound_bits, row.air_bits, row.over_bound, row.over_claim_bits, row.ece)
-    numbers = " ".join(f"{value:>8.4f}" for value in values)
-    return f"{row.seed:>6} {numbers} {row.verdict:>8} {row.verdict_error_bits:>+8.3f} {row.seconds:>8.0f}"
+    numbers = " ".join(f"{'-':>8}" if value is None else f"{value:>8.4f}" for value in values)
+    cause = next(iter(row.causes), "") if row.causes else ""
+    return f"{row.seed:>6} {numbers} {row.verdict:>8} {row.verdict_error_bits:>+8.3f} {row.seconds:>8.0f} {cause}"
 
 
-def read_device(profile: Profile, device: Device, seed: int, pages: int, folder: Path) -> Row:
+def read_device(profile: Profile, device: Device | ForeignDevice, seed: int, pages: int, folder: Path) -> Row:
     """Calibrate and read a device; `pages` are read beyond those of the verdict."""
+    pages += MOST_READ
+    if isinstance(device, ForeignDevice):
+        device.write(folder / "recording.h5", CALIBRATED + pages, LEVELS, seed)
     start = time.perf_counter()
-    recording, bundle = bundle_by_waves(folder, profile, device, MOST_READ + pages, seed)
+    own = device if isinstance(device, Device) else Device()  # the recording is there already
+    recording, bundle = bundle_by_waves(folder, profile, own, pages, seed)
     seconds = time.perf_counter() - start
     decoder = Decoder.load(bundle)
     with Recording.open(recording) as file:
@@ -100,20 +111,12 @@ def read_device(profile: Profile, device: Device, seed: int, pages: int, folder:
     goodness, reading = calibration.goodness, calibration.reading
     assert goodness is not None
     assert reading is not None  # the recording has pages that the fit has not seen
-    bound, _ = mean_information(
-        [
-            one
-            for page in range(BOUND_PAGES)
-            for one in sampled_concentrations(profile, device, LEVELS, BOUND_SYMBOLS, (seed, page))
-        ],
-        LEVELS,
-        seed,
-    )
+    bound = _bound_bits(profile, device, seed) if isinstance(device, Device) else None
     return Row(
         seed=seed,
         bound_bits=bound,
         air_bits=figures.air_bits_per_symbol,
-        over_bound=figures.air_bits_per_symbol / bound,
+        over_bound=bound and figures.air_bits_per_symbol / bound,
         over_claim_bits=figures.over_claim_bits_per_symbol,
         ece=figures.ece,
         verdict=goodness.verdict,
@@ -121,8 +124,18 @@ def read_device(profile: Profile, device: Device, seed: int, pages: int, folder:
         verdict_error_bits=reading.air_bits - float(np.mean(evaluation.air_per_page[MOST_READ:])),
         light_bits=reading.light_bits,
         user_bytes=reading.user_bytes,
+        causes={cause.name: cause.bits for cause in goodness.causes},
         seconds=seconds,
     )
+
+
+def _bound_bits(profile: Profile, device: Device, seed: int) -> float:
+    """Bound of a device's light, bits a symbol."""
+    sampled = (
+        sampled_concentrations(profile, device, LEVELS, BOUND_SYMBOLS, (seed, page)) for page in range(BOUND_PAGES)
+    )
+    bits, _ = mean_information([*chain.from_iterable(sampled)], LEVELS, seed)
+    return bits
 
 
 @click.command()
@@ -130,19 +143,30 @@ def read_device(profile: Profile, device: Device, seed: int, pages: int, folder:
 @click.option("--devices", default=20, show_default=True, type=click.IntRange(1))
 @click.option("--first-seed", default=1000, show_default=True, type=click.IntRange(0))
 @click.option("--set", "changes", multiple=True, metavar="TABLE.KEY=VALUE", help="Number of the true state to change.")
+@click.option("--foreign", "faults", type=click.FloatRange(0), help="Devices of the other simulator; share of faults.")
 @click.option("--pages", default=4, show_default=True, type=click.IntRange(1), help="Pages beyond the verdict's.")
 @click.option("--json", "json_path", required=True, type=OutputFile())
 def main(
-    profile_name: str, devices: int, first_seed: int, changes: tuple[str, ...], pages: int, json_path: Path
+    profile_name: str,
+    devices: int,
+    first_seed: int,
+    changes: tuple[str, ...],
+    faults: float | None,
+    pages: int,
+    json_path: Path,
 ) -> None:
     """Print the AIR of each device, its share of the bound, and its verdict."""
     profile = load_profile(profile_name)
-    settings: dict[str, object] = {"profile": profile.to_toml(), "set": [*changes], "pages": pages}
+    settings: dict[str, object] = {"profile": profile.to_toml(), "set": [*changes], "foreign": faults, "pages": pages}
     rows = {seed: row for seed, row in load(json_path, settings, Row).items() if row.failure is None}
     click.echo(f"{'seed':>6} " + " ".join(f"{column:>8}" for column in _COLUMNS))
     for seed in track(range(first_seed, first_seed + devices), "devices", unit="device"):
         if seed not in rows:
-            device = draw_device(np.random.default_rng(seed)).of_profile(profile).with_settings([*changes])
+            device: Device | ForeignDevice
+            if faults is not None:
+                device = ForeignDevice.draw(seed).with_faults(faults)
+            else:
+                device = draw_device(np.random.default_rng(seed)).of_profile(profile).with_settings([*changes])
             with tempfile.TemporaryDirectory() as folder:
                 try:
                     rows[seed] = read_device(profile, device, seed, pages, Path(folder))
@@ -160,4 +184,4 @@ def main(
 
 
 if __name__ == "__main__":
-    sys.exit(run(main, name="python -m analysis.comparison.drawn_devices"))
+    sys.exit(run(main, name="python -m analysis.verdicts.drawn_devices"))

@@ -1,0 +1,1 @@
+"""Verdicts of calibrations beside what is read afterwards, and the causes that they name."""
