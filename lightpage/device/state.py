@@ -129,6 +129,8 @@ class SlmDefects(TomlTable):
     level_cosine_rad: Annotated[float, Field(ge=-3, le=3, allow_inf_nan=False)] = 0.0
     level_sine_twice_rad: Annotated[float, Field(ge=-3, le=3, allow_inf_nan=False)] = 0.0
     """Times the sine of twice the nominal phase."""
+    level_ripple_rad: Annotated[float, Field(ge=-3, le=3, allow_inf_nan=False)] = 0.0
+    """Times the sine of twenty times the nominal phase, as a lookup table of few entries has."""
     unmodulated_relative: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """Amplitude of the light that is not modulated, over that of the light that is."""
     unmodulated_phase_rad: Phase = 0.0

@@ -20,7 +20,7 @@ def modulated(slm: SlmDefects, phase: Real, xp: Any = np) -> Complex:
     """
     turn = phase + slm.stroke_relative_error * phase
     turn = turn + slm.level_sine_rad * xp.sin(phase) + slm.level_cosine_rad * xp.cos(phase)
-    turn = turn + slm.level_sine_twice_rad * xp.sin(2 * phase)
+    turn = turn + slm.level_sine_twice_rad * xp.sin(2 * phase) + slm.level_ripple_rad * xp.sin(20 * phase)
     amplitude = 1 + slm.level_amplitude_relative * xp.cos(phase)
     unmodulated = complex(slm.unmodulated_relative * np.exp(1j * slm.unmodulated_phase_rad))
     light: Complex = amplitude * xp.exp(1j * turn) + unmodulated
