@@ -181,7 +181,9 @@ def main(profile_name: str, chosen: tuple[str, ...], changes: tuple[str, ...], j
         row = rows[fault, size]
         causes = ", ".join(f"{name} {bits:.3f}" for name, bits in (row.causes or {}).items())
         if row.air_bits is None or not fault:
-            click.echo(f"{fault or 'none':<20} {size:<8g} {row.failure or f'AIR {row.air_bits:.3f}'}  {causes}")
+            click.echo(
+                f"{fault or 'none':<20} {size:<8g} {row.failure or f'AIR {row.air_bits}, {row.verdict}'}  {causes}"
+            )
             continue
         cost = (rows["", 0.0].air_bits or 0.0) - row.air_bits
         counted += cost >= _LEAST_COST

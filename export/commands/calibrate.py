@@ -18,7 +18,7 @@ from lightpage.cli.paths import NewPath, OutputFile
 from lightpage.cli.progress_bar import percent_bar
 from lightpage.device.profile import Profile
 from lightpage.errors import CalibrationError, InvalidInputError, LightpageError
-from lightpage.export.commands.calibration_report import figures, symbols_beside_cameras, table
+from lightpage.export.commands.calibration_report import figures, losses, symbols_beside_cameras, table
 from lightpage.files import replace_file, write_json
 from lightpage.pictures import write_figure_png
 from lightpage.progress import Progress, note, warn
@@ -144,6 +144,8 @@ def calibrate(
         warn(what)
     if calibration.blemishes is not None and str(calibration.blemishes):
         click.echo(f"\n{calibration.blemishes}")
+    if causes := losses(calibration):
+        click.echo(f"\n{causes}")
     found = calibration.goodness
     if picture is not None and found is not None:
         replace_file(picture, lambda file: write_figure_png(file, goodness_figure(found), dpi=_DOTS), "picture")

@@ -51,6 +51,17 @@ def figures(calibration: Calibration, profile: Profile, seconds: float, lost: in
     }
 
 
+def losses(calibration: Calibration) -> str:
+    """Causes of what is lost with their bits and remedies, for people; empty where none was found."""
+    causes = () if calibration.goodness is None else calibration.goodness.causes
+    if not causes:
+        return ""
+    lines = ["lost, bits a symbol, estimated:"]
+    for cause in causes:
+        lines += [f"{cause.bits:>8.3f}  {cause.what}", f"{'':>10}remedy: {cause.remedy}"]
+    return "\n".join(lines)
+
+
 _AXIAL = tuple(NAMES[index] for index in indices("axial"))
 _UNITS = frozenset({"m", "rad", "px", "deg", "relative"})
 

@@ -289,7 +289,9 @@ def to_toml(table: TomlTable, without: Collection[str] = ()) -> str:
 
 
 def toml_value(value: object) -> str:
-    """A text, a truth value, a number or a list of such as TOML writes it."""
+    """A text, a truth value, a number, a list of such, or an inline table of them, as TOML writes it."""
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{key} = {toml_value(one)}' for key, one in value.items())}}}"
     if isinstance(value, str):
         # a JSON string is a TOML one but for this character
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -58,7 +58,7 @@ _LEAST_GAIN = 20.0
 the first step gains 11 on the bench device, and a second one 0.04."""
 _JUDGED = 2
 """Number of known pages that tell causes."""
-_EXPLAINED_FROM = 0.02
+_EXPLAINED_FROM = 0.04
 """Loss, bits a symbol, from which on its causes are searched."""
 _LINEARISED = 0.75
 """Share of a round's work after which the next device is known, and its statistics are measured."""

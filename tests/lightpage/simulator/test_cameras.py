@@ -62,7 +62,6 @@ class TestInterference:
             (quadrature_intensity(field, reference, error, sign) - plain) / 2, expected, atol=1e-12
         )
 
-
     def test_vibration_takes_contrast_as_the_mean_over_the_exposure_has_it(self) -> None:
         field, reference = complex_noise(6, (50, 1)), complex_noise(7, (50, 1))
         pistons, vibration = np.random.default_rng(8).standard_normal(200_000), Drift(vibration_rad=0.6)
