@@ -43,6 +43,8 @@ from lightpage.calibration.sampling_table import (
 from lightpage.calibration.waves.wave_fit import inverse_of_information
 from lightpage.calibration.waves.wave_model import ILLUMINATIONS, LaunchConditions
 from lightpage.device.profile import Profile
+from lightpage.page import modulation as modulations
+from lightpage.page.modulation import Modulation, page_basis
 from lightpage.recording.frame_pair import FramePair
 from lightpage.waves.grid import field_grid
 
@@ -68,6 +70,12 @@ _BLUR_STEP = 0.02
 """Finite difference of the blur's variance."""
 _BLUR_DEVIATION = 0.5
 """Standard deviation of the blur's variance about zero before a page is seen."""
+_LEVEL_STEP = 0.02
+"""Finite difference of the coefficients of the modulator's phases."""
+_LEVELS = [number for number, name in enumerate(modulations.NAMES) if not name.startswith("amplitude")]
+"""Coefficients of the modulation that change phases, in the order of `page_basis`."""
+_EXCLUDED = 5.0
+"""Standard deviations of a coefficient beyond which even levels are excluded."""
 _ILLUMINATION_STEP = 0.02
 """Finite difference of an illumination's term, over the even one."""
 
@@ -94,7 +102,8 @@ class DeviceFit:
     """Fisher scoring of a registered device.
 
     Unknowns are the parameters that the registration has fitted, the angle between the arms, the blur, the terms of the
-    illumination over the even one, and nuisance parameters of each page.
+    illumination over the even one, the modulator's phases, and nuisance parameters of each page. Even levels stay even
+    unless the counts exclude them.
 
     Args:
         likelihood: likelihood of the device's pages.
@@ -222,7 +231,8 @@ class DeviceFit:
         evaluations = fit.evaluations
         columns = self._by_steps(fit, evaluations, steps, round_number)
         parameters = np.append(of_light, of_cameras)
-        common = len(columns) + len(of_cameras)
+        before_levels = len(columns) + len(of_cameras)
+        common = before_levels + len(_LEVELS)
         total = common + NUISANCES * len(fit.pages)
         gradient = np.zeros(total)
         information = np.zeros((total, total))
@@ -231,7 +241,8 @@ class DeviceFit:
             by_cameras = self._by_cameras(registered.parameters, of_cameras, here, by_nuisance[SHIFT], fit.table)
             by_unknown = [column[number] for column in columns]
             split = len(of_light)
-            jacobian = np.stack([*by_unknown[:split], *by_cameras, *by_unknown[split:], *by_nuisance])
+            by_levels = self._by_levels(fit, number, here)
+            jacobian = np.stack([*by_unknown[:split], *by_cameras, *by_unknown[split:], *by_levels, *by_nuisance])
             nuisances = common + NUISANCES * number + np.arange(NUISANCES)
             own = np.append(np.arange(common), nuisances)
             gradient[own] += fit.gradient(jacobian, here)
@@ -246,7 +257,26 @@ class DeviceFit:
         blur = len(parameters) + 1
         gradient[blur] -= conditions.blur / _BLUR_DEVIATION**2
         information[blur, blur] += 1 / _BLUR_DEVIATION**2
-        return _solution(gradient, information)
+        levels = np.arange(before_levels, common)
+        coefficients = np.array(registered.modulation.coefficients)[_LEVELS]
+        gradient[levels] -= coefficients / modulations.PRIORS[_LEVELS] ** 2
+        information[levels, levels] += 1 / modulations.PRIORS[_LEVELS] ** 2
+        solution = _solution(gradient, information)
+        if registered.modulation.is_nominal and not _excluded(solution, levels):
+            return _solution(gradient, information, held=levels)
+        return solution
+
+    def _by_levels(self, fit: KnownPageFit, number: int, here: Derivatives) -> list[Real]:
+        """Derivatives of a page's expected counts, [2, N] each, by the coefficients of its modulator's phases."""
+        page = fit.pages[number]
+        functions = page_basis(np.mod(np.angle(self._pages[number].symbols), 2 * np.pi))
+        moved = [
+            self._likelihood.expected(
+                page.pair, fit.table, page.phases + _LEVEL_STEP * function, page.nuisance, here.places
+            )
+            for function in functions
+        ]
+        return [(there - here.expected) / _LEVEL_STEP for there in moved]
 
     def _by_steps(
         self,
@@ -330,11 +360,18 @@ def _other_steps(table: SamplingTable, turn_rad: float, blur: float) -> list[tup
     return steps
 
 
-def _solution(gradient: Real, information: Real) -> _Solution:
-    """Solve the normal equations."""
-    covariance = inverse_of_information(information)
+def _solution(gradient: Real, information: Real, held: Indices | None = None) -> _Solution:
+    """Solve the normal equations; unknowns that are `held` do not move."""
+    free = np.setdiff1d(np.arange(len(gradient)), [] if held is None else held)
+    covariance = np.zeros_like(information)
+    covariance[np.ix_(free, free)] = inverse_of_information(information[np.ix_(free, free)])
     step = covariance @ gradient
     return _Solution(step, np.sqrt(np.diag(covariance)), float(step @ gradient) / 2)
+
+
+def _excluded(solution: _Solution, levels: Indices) -> bool:
+    """Return whether a scoring step from even levels, whose coefficients have these indices, excludes them."""
+    return bool(np.max(np.abs(solution.step[levels]) / solution.deviations[levels]) > _EXCLUDED)
 
 
 def _moved(
@@ -357,8 +394,16 @@ def _moved(
     illumination = conditions.illumination * gain
     illumination[1:] += solution.step[count + 2 : count + 1 + ILLUMINATIONS] * illumination[0]
     moved = LaunchConditions(illumination, max(0.0, conditions.blur + float(solution.step[count + 1])))
+    coefficients = np.array(registered.modulation.coefficients)
+    level_deviations = np.array(registered.modulation_deviations)
+    first = count + 1 + ILLUMINATIONS
+    coefficients[_LEVELS] += solution.step[first : first + len(_LEVELS)]
+    moved_deviations = solution.deviations[first : first + len(_LEVELS)]
+    level_deviations[_LEVELS] = np.where(moved_deviations > 0, moved_deviations, level_deviations[_LEVELS])
     refined = replace(
         registered,
+        modulation=Modulation(tuple(coefficients.tolist())),
+        modulation_deviations=tuple(level_deviations.tolist()),
         parameters=vector,
         deviations=deviations,
         quadrature_phase=registered.quadrature_phase + float(solution.step[count]),
