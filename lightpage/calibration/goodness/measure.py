@@ -32,6 +32,7 @@ from lightpage.calibration.goodness.light import PageLight
 from lightpage.calibration.goodness.page_errors import (
     Explained,
     dead_pixels,
+    lost_bits,
     steps_to_neighbours,
     without_flicker,
     without_levels,
@@ -167,13 +168,13 @@ def measure_goodness(
     unexplained += beyond - amount * modulator[1]
     noise = frames + amount * modulator
     wrong = unexplained + by_level.variance + by_neighbours.variance
-    variance = noise[1] + _OWN_ERROR_RAD**2
-    lost = float(np.log2(1 + wrong / variance)) / 2
+    lost = float(np.log2(1 + wrong / (noise[1] + _OWN_ERROR_RAD**2))) / 2
+    drawn = frame_errors + np.sqrt(amount) * modulator_errors
     other_profile = unlike_profile(pages[0].device.parameters)
     by_symbols = {LEVELS: by_level, NEIGHBOURS: by_neighbours}
     causes: tuple[Cause, ...] = ()
     if lost >= explained_from or contrast_bits(page.terms) >= explained_from:
-        causes = _causes(twin, pages, page, errors, by_symbols, unexplained, variance, amount, gains)
+        causes = _causes(twin, pages, page, errors, by_symbols, unexplained, drawn, amount, gains)
     cause = other_profile or (_sentence(causes) if lost >= GOOD else "")
     return Goodness(
         verdict="good" if lost < GOOD and not cause else "usable" if lost < USABLE else "wrong",
@@ -223,7 +224,7 @@ def _causes(
     errors: Complex,
     by_symbols: dict[str, Explained],
     unexplained: float,
-    variance: float,
+    drawn: Complex,
     amount: float,
     gains: NDArray[np.uint8] | None,
 ) -> tuple[Cause, ...]:
@@ -236,14 +237,14 @@ def _causes(
         errors: errors of its symbols without those of levels and neighbours.
         by_symbols: what levels and neighbours explain of them, by the name of the cause.
         unexplained: phase variance that a better model would explain.
-        variance: phase variance of noise.
+        drawn: errors as noise alone makes them. An estimator by the fitted waves adds no errors of its own.
         amount: variance of the modulator's phase noise, a sample.
         gains: gains of the cameras' pixels, [2, H, W]; None if unknown.
     """
     every = [page, *(_page_errors(twin, other) for other in pages[1:])]
     kept, flicker = without_flicker([each.errors for each in every], [each.phases for each in every])
     kept = [without_levels(each, one.phases).residual for each, one in zip(kept, every, strict=True)]
-    dead = dead_pixels(kept, variance)
+    dead = dead_pixels(kept, float(np.mean(drawn.imag**2)))
     variances = {name: each.variance for name, each in by_symbols.items()}
     variances |= {FLICKER: flicker, LEVELS: max(0.0, variances[LEVELS] - flicker)}
     light = page.light
@@ -262,7 +263,8 @@ def _causes(
     for name, share in shares.items():
         variances[contrast or CONTRAST if name == CONTRAST else name] = share * rest
     wrong = sum(variances.values()) + max(0.0, rest * (1 - sum(shares.values())))
-    lost = float(np.log2(1 + wrong / variance)) / 2
+    variance = float(np.mean(drawn.imag**2))
+    lost = max(0.0, lost_bits(np.where(dead.where, 0, page.errors), variance) - lost_bits(drawn, variance))
     bits = {name: lost * each / max(wrong, _TINY) for name, each in variances.items()}
     bits[DEAD_PIXELS] = dead.bits
     if contrast == VIBRATION:
@@ -272,6 +274,8 @@ def _causes(
     bits[OTHER_SYMBOLS if foreign else UNKNOWN] = unknown
     details = {DEAD_PIXELS: str(dead)}
     found = [cause_of(name, each, details.get(name, "")) for name, each in bits.items() if each >= _LEAST_BITS]
+    if lost < GOOD and all(cause.name == UNKNOWN for cause in found):
+        return ()
     return tuple(sorted(found, key=lambda cause: (cause.name == UNKNOWN, -cause.bits)))
 
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 Real = NDArray[np.float64]
@@ -15,6 +16,8 @@ _NAMED = 3
 """Places that are named."""
 _OUTLIER = 6.0
 """Deviations from which on a symbol's error is none of noise."""
+_BLOCK = 5
+"""Side, symbols, of the squares over which the variance of errors is compared with that of noise."""
 _LEAST_ERROR = 0.1
 """Least error of a symbol with a dead pixel, relative to its light."""
 _MOST_DEAD = 0.1
@@ -123,6 +126,17 @@ def steps_to_neighbours(phases: Real) -> Real:
         beside = [np.roll(phases, shift, axis) for shift in (1, -1)]
         terms += [beside[0] + beside[1] - 2 * np.pi, np.sin(beside[0] - phases) + np.sin(beside[1] - phases)]
     return np.stack(terms)
+
+
+def lost_bits(errors: Complex, noise: float) -> float:
+    """Information that errors of phase lose beyond those of noise, bits a symbol; where errors are, and not elsewhere.
+
+    Args:
+        errors: relative errors of the symbols, [ny, nx].
+        noise: variance of a symbol's phase by noise.
+    """
+    variance = scipy.ndimage.uniform_filter(errors.imag**2, _BLOCK)
+    return float(np.mean(np.log2(np.maximum(variance / noise, 1)))) / 2
 
 
 def dead_pixels(errors: Sequence[Complex], noise: float) -> DeadPixels:

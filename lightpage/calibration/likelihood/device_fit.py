@@ -60,8 +60,6 @@ _LEAST_GAIN = 20.0
 the first step gains 11 on the bench device, and a second one 0.04."""
 _JUDGED = 2
 """Number of known pages that tell causes."""
-_EXPLAINED_FROM = 0.04
-"""Loss, bits a symbol, from which on its causes are searched."""
 _LINEARISED = 0.75
 """Share of a round's work after which the next device is known, and its statistics are measured."""
 _TURN_STEP_RAD = 0.01
@@ -184,7 +182,7 @@ class DeviceFit:
             moved = replace(registered, parameters=_at_page(registered.parameters, page.nuisance))
             launched = conditions._replace(illumination=illumination * (page.gain * phase))
             shown.append(ShownPage(self._device(moved), launched, known.pair, known.symbols))
-        return measure_goodness(self._twin, shown, gains=self._gains, explained_from=_EXPLAINED_FROM)
+        return measure_goodness(self._twin, shown, gains=self._gains, explained_from=0.0)
 
     def _device(self, registered: Registered) -> CalibratedDevice:
         return CalibratedDevice(
