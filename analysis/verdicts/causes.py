@@ -63,7 +63,7 @@ def _one(name: str, key: str, *sizes: float) -> Fault:
 
 _AXIAL = {"geometry.modulator_axial_rad": 1.2, "in_phase_camera.axial_rad": 0.8, "quadrature_camera.axial_rad": -0.7}
 FAULTS = {
-    "hot pixels": _one("camera pixels", "sensor.hot_pixel_share", 0.01, 0.03, 0.08),
+    "hot pixels": _one("camera pixels", "sensor.hot_pixel_share", 0.01, 0.03, 0.045),
     "dust": Fault(("dust",), (2, 5, 10), {"sensor.late_dust_specks": 1}),
     "walls": _one("walls", "geometry.pipe_height_relative_error", 0.0003, 0.0006, 0.001),
     "taper": _one("taper", "geometry.pipe_taper_relative", 0.002, 0.004, 0.008),

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from lightpage.calibration.goodness.camera_faults import CONTRAST
 from lightpage.calibration.goodness.equations import coarse_places, equations_of_contrast, equations_of_fit
 from lightpage.calibration.goodness.light import PageLight, places_on_facet, radius2
-from lightpage.calibration.goodness.remedies import NEIGHBOURS
+from lightpage.calibration.goodness.remedies import NEIGHBOURS, WALLS
 from lightpage.calibration.parameters import NAMES, PRIORS, indices
 
 Real = NDArray[np.float64]
@@ -152,7 +152,7 @@ def _suspects(light: PageLight) -> Iterator[tuple[str, list[Real]]]:
     yield "camera tilt", [*map(light.equations_of, tilted)]
     leaned = [coarse.from_exit(coarse.to_exit(np.asarray(page * place), 1j * squares)) for place in (x, y)]
     yield "modulator tilt", [*map(light.equations_of, leaned)]
-    for name, width in (("walls", "pipe_height_relative"), ("taper", "pipe_taper")):
+    for name, width in ((WALLS, "pipe_height_relative"), ("taper", "pipe_taper")):
         changed = [light.changed(None, None, **{width: step}).to_cameras(page) - here for step in _STEPS]
         yield name, [*map(light.equations_of, changed)]
     length = light.waves.channel.geometry.pipe_length_m

@@ -179,6 +179,21 @@ class PageLight:
         )
         self.fields = waves.from_exit(waves.to_exit(self.page, transmission))
 
+    def residual_of(self, fields: Complex) -> Real:
+        """Residual of the equations on the coarse grid, flat, if the cameras' light were `fields` there.
+
+        The mean counts are corrected as by `correct_counts`.
+        """
+        field = fields / self._amplitude[self.every]
+        brightness = np.abs(self._arms + field) ** 2
+        visible = self.visible[self.every]
+        counts = self.counts[:, *self.every] - (brightness - 1) / 2
+        for camera, level in enumerate(self.references[:, *self.every]):
+            expected = level * brightness[camera]
+            curve = CountCurve.measured(expected[visible], counts[camera][visible])
+            counts[camera] -= curve.at(expected)
+        return self.equations(counts)
+
     def correct_counts(self) -> None:
         """Measure the mean count as a function of the expected count, and correct the model by it.
 

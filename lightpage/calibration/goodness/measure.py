@@ -48,9 +48,11 @@ from lightpage.calibration.goodness.remedies import (
     OTHER_SYMBOLS,
     UNKNOWN,
     VIBRATION,
+    WALLS,
     cause_of,
 )
 from lightpage.calibration.goodness.verdict import GOOD, USABLE, Cause, Goodness, Map
+from lightpage.calibration.goodness.walls import relative_height
 from lightpage.calibration.interfaces import Twin
 from lightpage.calibration.waves.wave_model import LaunchConditions, on_modulator
 from lightpage.errors import CalibrationError
@@ -79,6 +81,8 @@ _FOREIGN = 0.1
 """Least mean square of the symbols' relative errors that shows the light of other symbols."""
 _LEAST_SHARE = 0.2
 """Least share of what is lost that the largest cause makes, to be called the likeliest one."""
+_FITTED_BITS = 0.02
+"""Least information that unequal walls cost, bits a symbol, for their distance to be fitted."""
 _LEAST_BITS = 0.005
 """Least information that a named cause costs, bits a symbol."""
 
@@ -273,10 +277,16 @@ def _causes(
     foreign = np.mean(np.abs(errors) ** 2) > _FOREIGN
     bits[OTHER_SYMBOLS if foreign else UNKNOWN] = unknown
     details = {DEAD_PIXELS: str(dead)}
-    found = [cause_of(name, each, details.get(name, "")) for name, each in bits.items() if each >= _LEAST_BITS]
-    if lost < GOOD and all(cause.name == UNKNOWN for cause in found):
+    if bits.get(WALLS, 0.0) >= _FITTED_BITS:
+        width_um = 1e6 * light.waves.channel.geometry.pipe_width_m
+        height, deviation = (width_um * each for each in relative_height(light))
+        details[WALLS] = (
+            f" ({height:+.2f} +- {deviation:.2f} um further apart along y' than the {width_um:.1f} along x)"
+        )
+    causes = [cause_of(name, each, details.get(name, "")) for name, each in bits.items() if each >= _LEAST_BITS]
+    if lost < GOOD and all(cause.name == UNKNOWN for cause in causes):
         return ()
-    return tuple(sorted(found, key=lambda cause: (cause.name == UNKNOWN, -cause.bits)))
+    return tuple(sorted(causes, key=lambda cause: (cause.name == UNKNOWN, -cause.bits)))
 
 
 def _frames_of(

@@ -29,6 +29,7 @@ DUST = "dust"
 FLICKER = "flicker"
 DEAD_PIXELS = "dead modulator pixels"
 VIBRATION = "vibration"
+WALLS = "walls"
 
 REMEDIES = {
     "camera focus": Remedy("a curvature over the exit facet: cameras out of focus", "focus both cameras on one plane"),
@@ -44,7 +45,7 @@ REMEDIES = {
     ),
     "camera tilt": Remedy("a focus that changes over the image: tilted cameras", "stand the cameras upright"),
     "modulator tilt": Remedy("a focus that changes over the page: a tilted modulator", "stand the modulator upright"),
-    "walls": Remedy(
+    WALLS: Remedy(
         "walls of the pipe that are not equally far apart in x and y, or that polarise light as such walls would",
         "ask the pipe's maker for its two widths; polarise the light along a wall",
     ),

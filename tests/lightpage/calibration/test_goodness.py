@@ -13,6 +13,7 @@ from lightpage.calibration.goodness.frame_noise import noise_curve, noise_like, 
 from lightpage.calibration.goodness.light import PageLight
 from lightpage.calibration.goodness.measure import ShownPage, measure_goodness
 from lightpage.calibration.goodness.verdict import Goodness
+from lightpage.calibration.goodness.walls import relative_height
 from lightpage.calibration.parameters import NAMES
 from lightpage.calibration.waves.wave_fit import LevelPrior, WaveFit
 from lightpage.calibration.waves.wave_model import LaunchConditions
@@ -174,3 +175,39 @@ def test_values_of_the_grid_come_to_the_pixels_that_see_them() -> None:
     row, column = np.stack([rows, columns]) + np.tensordot(back, off, 1)
     np.testing.assert_allclose(near[inside], wave(row, column)[inside], atol=0.03)
     assert np.isnan(image[:, -1]).all()
+
+
+@pytest.mark.parametrize("height", [0.001, 0.003])
+def test_walls_of_two_distances_are_measured(height: float) -> None:
+    light = PageLight(TWIN, *fitted_page(f"geometry.pipe_height_relative_error={height}"))
+    light.correct_amplitude()
+    light.correct_counts()
+    value, deviation = relative_height(light)
+    assert value == pytest.approx(height, abs=max(0.1 * height, 3 * deviation))
+    assert deviation < 0.1 * height
+
+
+@pytest.mark.parametrize(
+    ("setting", "name"),
+    [
+        ("sensor.black_level_relative=0.05", "black level"),
+        ("reference.recorded_exposure_relative=1.1", "reference exposure"),
+        ("drift.vibration_rad=0.4", "vibration"),
+        ("sensor.late_dust_specks=12", "dust"),
+        ("geometry.ghost_relative=0.04", "ghost"),
+    ],
+)
+def test_a_fault_of_the_bench_is_the_largest_cause(setting: str, name: str) -> None:
+    found = measure_goodness(TWIN, [ShownPage(*fitted_page(setting))], explained_from=0.0)
+    assert found.causes[0].name == name
+    assert found.causes[0].remedy
+
+
+def test_vibration_costs_the_contrast_and_what_the_model_lacks_by_it() -> None:
+    found = measure_goodness(TWIN, [ShownPage(*fitted_page("drift.vibration_rad=0.4"))], explained_from=0.0)
+    lost_contrast = 0.4**2 / 2 / np.log(2)
+    assert 0.9 * lost_contrast < found.causes[0].bits < 2 * lost_contrast
+
+
+def test_a_good_fit_has_no_causes() -> None:
+    assert measure_goodness(TWIN, [ShownPage(*fitted_page())], explained_from=0.0).causes == ()
