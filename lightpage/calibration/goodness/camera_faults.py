@@ -24,10 +24,10 @@ _BRIGHT = 0.7
 """Least expected count of a pixel that is fitted, over the reference's."""
 _CORRELATED = 3.0
 """Variance of the fitted terms over that of as many independent equations."""
-_DEVIATIONS = 4.0
+_DEVIATIONS = 5.0
 """Standard deviations from which on a term is a fault."""
 _LEAST_CONSTANT = 0.03
-_LEAST_CONTRAST = 0.06
+_LEAST_CONTRAST = 0.08
 _LEAST_BEND = 0.04
 """Least terms that are named. The resampling of frames makes up to 0.02 of a signal's factor."""
 _BLACK_SHARE = 0.25
