@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from lightpage.calibration.goodness.frame_noise import noise_curve
 from lightpage.calibration.goodness.light import PageLight
+from lightpage.words import counted
 
 Real = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -38,6 +39,10 @@ _LEAST_SHADE = 0.1
 """Least share of the light that a shadow takes."""
 _SHADE_DEVIATIONS = 7.0
 """Standard deviations from which on a place is a shadow."""
+_JOINED_PX = 2
+"""Half of the distance to which shaded pixels belong to one shadow."""
+_NAMED = 3
+"""Places that are named of each camera."""
 _MOST_SHADE = 0.1
 """Largest share of pixels in shadows; more are no dust."""
 
@@ -140,3 +145,15 @@ def shadows(frames: list[NDArray[np.integer]], expected: list[Image]) -> NDArray
     spread = float(scipy.stats.median_abs_deviation(ratio[bright], scale="normal"))
     dark = bright & (ratio < usual - max(_LEAST_SHADE, _SHADE_DEVIATIONS * spread))
     return np.asarray(dark & (np.mean(dark) < _MOST_SHADE))
+
+
+def named_shadows(dark: NDArray[np.bool_]) -> str:
+    """Name the places of shadows on both cameras, [2, H, W], in words; empty where there are none."""
+    parts = []
+    for name, shaded in zip(("in-phase", "quadrature"), dark, strict=True):
+        labels, count = scipy.ndimage.label(scipy.ndimage.binary_dilation(shaded, iterations=_JOINED_PX))
+        middles = scipy.ndimage.center_of_mass(shaded, labels, range(1, min(count, _NAMED) + 1))
+        places = ", ".join(f"({round(column)}, {round(row)})" for row, column in middles)
+        if count:
+            parts.append(f"{name} camera: {counted(count, 'speck')} at {places}{', ...' if count > _NAMED else ''}")
+    return f" ({'; '.join(parts)})" if parts else ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +21,7 @@ from lightpage.calibration.waves.wave_model import LaunchConditions
 from lightpage.device.state import Device, Sensor
 from lightpage.page.symbols import symbol_phases
 from lightpage.recording.frame_pair import FramePair
-from lightpage.simulator.cameras import to_counts
+from lightpage.simulator.cameras import Blemishes, to_counts
 from lightpage.simulator.simulator import Simulator
 from lightpage.simulator.true_optics import perfectly_calibrated
 from lightpage.train.models.twin import RayTwin, TorchTwin
@@ -201,6 +202,17 @@ def test_a_fault_of_the_bench_is_the_largest_cause(setting: str, name: str) -> N
     found = measure_goodness(TWIN, [ShownPage(*fitted_page(setting))], explained_from=0.0)
     assert found.causes[0].name == name
     assert found.causes[0].remedy
+
+
+def test_dust_that_settled_after_the_references_is_found_where_it_is() -> None:
+    camera, sensor = PROFILE.camera, Device().with_settings(["sensor.late_dust_specks=6"]).sensor
+    found = measure_goodness(TWIN, [ShownPage(*fitted_page("sensor.late_dust_specks=6"))], explained_from=0.0)
+    dust = next(cause for cause in found.causes if cause.name == "dust")
+    named = re.search(r"quadrature camera: \d+ specks? at \((\d+), (\d+)\)", dust.what)
+    assert named is not None
+    column, row = map(int, named.groups())
+    passed = Blemishes.of(camera, sensor, 1).late_transmission
+    assert np.min(np.asarray(passed)[row - 2 : row + 3, column - 2 : column + 3]) < 0.8
 
 
 def test_vibration_costs_the_contrast_and_what_the_model_lacks_by_it() -> None:
