@@ -32,7 +32,7 @@ from lightpage.calibration.likelihood.known_page_fit import (
 )
 from lightpage.calibration.likelihood.measure import light_table
 from lightpage.calibration.likelihood.statistics import Statistics
-from lightpage.calibration.likelihood.table import count_tensors
+from lightpage.calibration.likelihood.table import amplitude_tensors, count_tensors
 from lightpage.calibration.parameters import NAMES, SEEN_BY_CAMERAS, STEPS
 from lightpage.calibration.sampling_table import (
     SamplingTable,
@@ -44,7 +44,8 @@ from lightpage.calibration.waves.wave_fit import inverse_of_information
 from lightpage.calibration.waves.wave_model import ILLUMINATIONS, LaunchConditions
 from lightpage.device.profile import Profile
 from lightpage.page import modulation as modulations
-from lightpage.page.modulation import Modulation, page_basis
+from lightpage.page.correction import wrapped
+from lightpage.page.modulation import Modulation
 from lightpage.recording.frame_pair import FramePair
 from lightpage.waves.grid import field_grid
 
@@ -69,9 +70,7 @@ _BLUR_STEP = 0.02
 _BLUR_DEVIATION = 0.5
 """Standard deviation of the blur's variance about zero before a page is seen."""
 _LEVEL_STEP = 0.02
-"""Finite difference of the coefficients of the modulator's phases."""
-_LEVELS = [number for number, name in enumerate(modulations.NAMES) if not name.startswith("amplitude")]
-"""Coefficients of the modulation that change phases, in the order of `page_basis`."""
+"""Finite difference of the coefficients of the modulation."""
 _EXCLUDED = 5.0
 """Standard deviations of a coefficient beyond which even levels are excluded."""
 _ILLUMINATION_STEP = 0.02
@@ -100,7 +99,7 @@ class DeviceFit:
     """Fisher scoring of a registered device.
 
     Unknowns are the parameters that the registration has fitted, the angle between the arms, the blur, the terms of the
-    illumination over the even one, the modulator's phases, and nuisance parameters of each page. Even levels stay even
+    illumination over the even one, the modulation, and nuisance parameters of each page. Even levels stay even
     unless the counts exclude them.
 
     Args:
@@ -229,8 +228,9 @@ class DeviceFit:
         evaluations = fit.evaluations
         columns = self._by_steps(fit, evaluations, steps, round_number)
         parameters = np.append(of_light, of_cameras)
+        moved_levels = _moved_levels(registered.modulation)
         before_levels = len(columns) + len(of_cameras)
-        common = before_levels + len(_LEVELS)
+        common = before_levels + len(moved_levels)
         total = common + NUISANCES * len(fit.pages)
         gradient = np.zeros(total)
         information = np.zeros((total, total))
@@ -239,7 +239,7 @@ class DeviceFit:
             by_cameras = self._by_cameras(registered.parameters, of_cameras, here, by_nuisance[SHIFT], fit.table)
             by_unknown = [column[number] for column in columns]
             split = len(of_light)
-            by_levels = self._by_levels(fit, number, here)
+            by_levels = self._by_levels(fit, number, here, moved_levels)
             jacobian = np.stack([*by_unknown[:split], *by_cameras, *by_unknown[split:], *by_levels, *by_nuisance])
             nuisances = common + NUISANCES * number + np.arange(NUISANCES)
             own = np.append(np.arange(common), nuisances)
@@ -256,25 +256,32 @@ class DeviceFit:
         gradient[blur] -= conditions.blur / _BLUR_DEVIATION**2
         information[blur, blur] += 1 / _BLUR_DEVIATION**2
         levels = np.arange(before_levels, common)
-        coefficients = np.array(registered.modulation.coefficients)[_LEVELS]
-        gradient[levels] -= coefficients / modulations.PRIORS[_LEVELS] ** 2
-        information[levels, levels] += 1 / modulations.PRIORS[_LEVELS] ** 2
+        gradient[levels] -= np.array(registered.modulation.coefficients) / modulations.PRIORS**2
+        information[levels, levels] += 1 / modulations.PRIORS**2
         solution = _solution(gradient, information)
         if registered.modulation.is_nominal and not _excluded(solution, levels):
             return _solution(gradient, information, held=levels)
         return solution
 
-    def _by_levels(self, fit: KnownPageFit, number: int, here: Derivatives) -> list[Real]:
-        """Derivatives of a page's expected counts, [2, N] each, by the coefficients of its modulator's phases."""
+    def _by_levels(
+        self, fit: KnownPageFit, number: int, here: Derivatives, moved: Sequence[tuple[Modulation, SamplingTable]]
+    ) -> list[Real]:
+        """Derivatives of a page's expected counts, [2, N] each, by the coefficients of the modulation.
+
+        Args:
+            fit: fit of the pages.
+            number: number of the page.
+            here: evaluation of the page.
+            moved: modulation after a step along each coefficient, with its tensors.
+        """
         page = fit.pages[number]
-        functions = page_basis(np.mod(np.angle(self._pages[number].symbols), 2 * np.pi))
-        moved = [
-            self._likelihood.expected(
-                page.pair, fit.table, page.phases + _LEVEL_STEP * function, page.nuisance, here.places
-            )
-            for function in functions
-        ]
-        return [(there - here.expected) / _LEVEL_STEP for there in moved]
+        known = self._pages[number]
+        derivatives: list[Real] = []
+        for modulation, tensors in moved:
+            phases = page.phases + wrapped(np.angle(known.light(modulation)) - page.phases)
+            there = self._likelihood.expected(page.pair, fit.table | tensors, phases, page.nuisance, here.places)
+            derivatives.append((there - here.expected) / _LEVEL_STEP)
+        return derivatives
 
     def _by_steps(
         self,
@@ -344,6 +351,17 @@ def _at_page(parameters: Real, nuisance: Real) -> Real:
     return moved
 
 
+def _moved_levels(modulation: Modulation) -> list[tuple[Modulation, SamplingTable]]:
+    """Modulation after a step along each of its coefficients, with the tensors that change."""
+    moved = []
+    for number in range(len(modulations.NAMES)):
+        coefficients = np.array(modulation.coefficients)
+        coefficients[number] += _LEVEL_STEP
+        stepped = Modulation(tuple(coefficients.tolist()))
+        moved.append((stepped, amplitude_tensors(stepped)))
+    return moved
+
+
 def _other_steps(table: SamplingTable, turn_rad: float, blur: float) -> list[tuple[SamplingTable, float]]:
     """Tensors that change with steps along turn, blur and the terms of the illumination, and the steps."""
     turned = turn_rad + _TURN_STEP_RAD
@@ -392,12 +410,10 @@ def _moved(
     illumination = conditions.illumination * gain
     illumination[1:] += solution.step[count + 2 : count + 1 + ILLUMINATIONS] * illumination[0]
     moved = LaunchConditions(illumination, max(0.0, conditions.blur + float(solution.step[count + 1])))
-    coefficients = np.array(registered.modulation.coefficients)
-    level_deviations = np.array(registered.modulation_deviations)
-    first = count + 1 + ILLUMINATIONS
-    coefficients[_LEVELS] += solution.step[first : first + len(_LEVELS)]
-    moved_deviations = solution.deviations[first : first + len(_LEVELS)]
-    level_deviations[_LEVELS] = np.where(moved_deviations > 0, moved_deviations, level_deviations[_LEVELS])
+    levels = slice(count + 1 + ILLUMINATIONS, count + 1 + ILLUMINATIONS + len(modulations.NAMES))
+    coefficients = np.array(registered.modulation.coefficients) + solution.step[levels]
+    fitted = solution.deviations[levels]
+    level_deviations = np.where(fitted > 0, fitted, registered.modulation_deviations)
     refined = replace(
         registered,
         modulation=Modulation(tuple(coefficients.tolist())),

@@ -21,6 +21,10 @@ _SMOOTHED = 1.5
 _DEVIATIONS = 4.0
 """Standard deviations below the median about a symbol from which on its light lies beside a camera, and its information
 is not smoothed. That of other symbols varies with the light of the others, on a page of the bench device by 0.18."""
+_LEAST_SEEN = 0.9
+"""Share of its light on both cameras below which rays tell that a symbol's light lies beside a camera."""
+_LEAST_BESIDE = 0.05
+"""Least information of such a symbol, over the median about it. In the dimmest light it has a large error."""
 _MOST_SPREAD = 0.2
 """Largest standard deviation of the information about its median with which such symbols are told from chance."""
 _DAMPING = 2.0
@@ -37,11 +41,14 @@ _LEAST_INFORMATION = 1e-3
 """Least information, over the page's median."""
 
 
-def measured_information(fit: KnownPageFit, progress: ProgressCallback = lambda share: None) -> SamplingTable:
+def measured_information(
+    fit: KnownPageFit, seen: Real, progress: ProgressCallback = lambda share: None
+) -> SamplingTable:
     """Measure the Fisher information of the symbols, and how they couple with the nuisance parameters.
 
     Args:
         fit: fit of the known pages, with gains and statistics of the counts.
+        seen: share of each symbol's light that lands on both cameras, [ny, nx]; see `seen_share`.
         progress: called with the finished share of the work.
 
     Returns:
@@ -64,7 +71,7 @@ def measured_information(fit: KnownPageFit, progress: ProgressCallback = lambda 
             curvature += probe * fit.hessian_product(page, current, probe) / _PROBES / page.power_gain
         couplings += fit.couplings(page, current) / page.power_gain
         normal += fit.normal_matrix(fit.by_nuisance(page, current), current) / page.power_gain
-    information = _smoothed(curvature / count)
+    information = _smoothed(curvature / count, seen)
     information = np.maximum(information, _LEAST_INFORMATION * np.median(information))
     couplings = np.stack([scipy.ndimage.median_filter(each, _MEDIAN) for each in couplings[_FITTED] / count])
     progress(count / (count + 1))
@@ -81,12 +88,22 @@ def measured_information(fit: KnownPageFit, progress: ProgressCallback = lambda 
     }
 
 
-def _smoothed(information: Real) -> Real:
-    """Smooth information [ny, nx] but that of symbols whose light lies beside a camera, which is damped."""
+def _smoothed(information: Real, seen: Real) -> Real:
+    """Smooth information [ny, nx] but that of symbols whose light lies beside a camera, which is damped.
+
+    Rays tell which these are, and where information varies little from page to page, it tells itself.
+
+    Args:
+        information: measured information.
+        seen: share of each symbol's light that lands on both cameras.
+    """
     usual = scipy.ndimage.median_filter(information, _MEDIAN)
     relative = information / np.where(usual > 0, usual, 1)
     spread = scipy.stats.median_abs_deviation(relative, axis=None, scale="normal")
     dark = (relative < 1 - _DEVIATIONS * spread) & (spread <= _MOST_SPREAD)
+    beside = (seen < _LEAST_SEEN) & (relative < 1)
+    information = np.where(beside, np.maximum(information, _LEAST_BESIDE * usual), information)
+    dark |= beside
     total = scipy.ndimage.gaussian_filter(np.where(dark, 0, information), _SMOOTHED)
     weight = scipy.ndimage.gaussian_filter((~dark).astype(np.float64), _SMOOTHED)
     return np.where(dark, _DAMPING * information, total / np.maximum(weight, _TINY))

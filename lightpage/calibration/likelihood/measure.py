@@ -8,6 +8,7 @@ import numpy as np
 
 from lightpage.calibration.calibrate import KnownPage
 from lightpage.calibration.calibrated_device import CalibratedDevice
+from lightpage.calibration.coherence import seen_share
 from lightpage.calibration.interfaces import Twin
 from lightpage.calibration.likelihood.information import measured_information
 from lightpage.calibration.likelihood.interfaces import PageLikelihood, ProgressCallback
@@ -61,4 +62,5 @@ def estimator_table(
     table = light_table(twin, device, statistics.conditions, likelihood.apart_inputs(device))
     fit = KnownPageFit(likelihood, table, pages, device.modulation)
     fit.fit_gains(statistics)
-    return {**table, **measured_information(fit, progress)}
+    seen = seen_share(twin, device.parameters, device.profile)
+    return {**table, **measured_information(fit, seen, progress)}

@@ -54,14 +54,18 @@ def launch_tensors(
         `lightpage.train.models.likelihood.modulator`; point_spread [7].
     """
     coefficients = conditions.illumination * np.exp(-1j * np.angle(conditions.illumination[0]))
-    series = amplitude_series(modulation)
     return {
         "blur": np.array(conditions.blur, np.float32),
         "illumination": np.stack([coefficients.real, coefficients.imag]).astype(np.float32),
-        "amplitude_series": series,
-        "slope_power": slope_power(series, modulation),
+        **amplitude_tensors(modulation),
         "point_spread": point_spread(profile, parameters, conditions.blur),
     }
+
+
+def amplitude_tensors(modulation: Modulation) -> SamplingTable:
+    """Tensors `amplitude_series` and `slope_power` of a modulation, see `launch_tensors`."""
+    series = amplitude_series(modulation)
+    return {"amplitude_series": series, "slope_power": slope_power(series, modulation)}
 
 
 def point_spread(profile: Profile, parameters: Real, blur: float) -> NDArray[np.float32]:
