@@ -209,10 +209,22 @@ class Calibration(TomlTable):
             update={
                 "coherence_at_first": self.reference_coherence,
                 "calibrated_pages": (*self.calibrated_pages, *fitted.calibrated_pages),
+                "goodness": self.of_refit(fitted.goodness),
                 "statistics": fitted.statistics or self.statistics,
                 "blemishes": fitted.blemishes or self.blemishes,
             }
         )
+
+    def of_refit(self, goodness: Goodness | None) -> Goodness | None:
+        """Goodness of a re-fit that started here, by the light that it leaves unexplained.
+
+        Pages that were read have judged a device whose light the model does not explain. An estimate does not call its
+        re-fit wrong.
+        """
+        judged = self.reading is not None or (self.goodness is not None and self.goodness.verdict == NOT_JUDGED)
+        if goodness is None or goodness.verdict != "wrong" or not judged:
+            return goodness
+        return goodness.model_copy(update={"verdict": NOT_JUDGED})
 
     @property
     def reference_coherence(self) -> float:

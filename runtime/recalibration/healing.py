@@ -304,7 +304,8 @@ class _Healing:
         """
         bundle = model.decoder.bundle
         page = self._known_page(known.pairs[0], known.symbols[0])
-        goodness = goodness_of(self._twin, self._near(model), page, lambda _: progress("unexplained light", 1.0))
+        estimated = goodness_of(self._twin, self._near(model), page, lambda _: progress("unexplained light", 1.0))
+        goodness = bundle.calibration.of_refit(estimated)
         return _Model(
             *self._with(bundle.calibration.model_copy(update={"goodness": goodness, "reading": None})), model.fitted
         )

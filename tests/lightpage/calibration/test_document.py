@@ -8,6 +8,7 @@ import pytest
 
 from lightpage.calibration.calibrate import KnownPage, Registered, calibrate, check_found
 from lightpage.calibration.document import Calibration, load_calibration, parse_calibration
+from lightpage.calibration.goodness.remedies import cause_of
 from lightpage.calibration.goodness.verdict import Reading
 from lightpage.calibration.known_pages import known_pages
 from lightpage.calibration.parameters import NAMES, PRIORS
@@ -202,3 +203,24 @@ def test_a_re_fit_remembers_where_the_device_began(calibration: Calibration) -> 
     assert parse_calibration(third.to_toml()) == third
     assert (third.coherence_after, third.reference_coherence, third.turn_rad) == (0.7, 0.8, -1.5)
     assert third.calibrated_pages == (*HASHES, "1" * 64, "2" * 64)
+
+
+def test_a_re_fit_of_a_device_that_reads_is_not_called_wrong_by_the_light_that_it_leaves(
+    calibration: Calibration,
+) -> None:
+    read = calibration.judged(READ)
+    second = read.followed_by(calibration)
+    third = second.followed_by(calibration)
+    for refit in (second, third):
+        assert refit.goodness is not None
+        assert refit.goodness.verdict == "not judged"
+        refit.check_good("re-fit")
+    unread = calibration.followed_by(calibration)
+    assert unread.is_wrong
+
+
+def test_causes_are_read_back_as_they_were_written(calibration: Calibration) -> None:
+    cause = cause_of("walls", 0.2, ' (+0.7 "um")')
+    goodness = UNEXPLAINED.model_copy(update={"causes": (cause, cause_of("unknown", 0.1))})
+    named = calibration.model_copy(update={"goodness": goodness})
+    assert parse_calibration(named.to_toml()) == named
