@@ -3,7 +3,8 @@
     python -m analysis.verdicts.causes --json F
     python -m analysis.verdicts.causes --fault ghost --fault walls --json F
 
-A device with one fault of each size is calibrated by two known pages, without torch. Four further pages are read. What
+A device with one fault of each size is calibrated by two known pages, by the graphs of the shipped bundle where these
+allow for it. Four further pages are read. What
 the fault costs is the AIR that they lose against those of the same device without it. Only faults that cost at least
 0.03 bit count: others are no causes of a loss. An interrupted run continues.
 """
@@ -31,7 +32,8 @@ from lightpage.progress import track, warn
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.new_bundle import calibrating_decoder
 from lightpage.runtime.archives.recordings.reading import MOST_READ
-from lightpage.runtime.recalibration.from_nominal import calibrate_by_graphs
+from lightpage.runtime.recalibration.from_nominal import OtherGraphsWantedError, calibrate_by_graphs
+from lightpage.train.trainers.calibration import calibrate_recording
 
 _SEED = 5
 _LEAST_COST = 0.03
@@ -119,10 +121,14 @@ def measured(profile: Profile, device: Device, fault: str, size: float) -> Row:
         simulate(path, profile, device, CALIBRATED + MOST_READ, _SEED)
         with Recording.open(path) as recording:
             decoder = calibrating_decoder(None, recording, profile)
-            assert decoder is not None  # the shipped bundle is of this profile
-            pages = first_lit_pages(recording, CALIBRATED, warn)
             try:
-                calibration = calibrate_by_graphs(decoder, recording, pages, lambda stage, share: None)
+                pages = first_lit_pages(recording, CALIBRATED, warn)
+                try:
+                    assert decoder is not None  # the shipped bundle is of this profile
+                    calibration = calibrate_by_graphs(decoder, recording, pages, lambda stage, share: None)
+                except OtherGraphsWantedError:
+                    decoder = None
+                    calibration = calibrate_recording(recording, profile, pages, lambda stage, share: None)
                 out = Path(folder) / "bundle.zip"
                 calibration = judged_by_reading(
                     decoder, calibration, recording, profile, out, lambda stage, share: None

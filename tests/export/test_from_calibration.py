@@ -1,6 +1,7 @@
 """A bundle of a calibration alone reads its device's pages, with as many steps as it is asked for."""
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -390,6 +391,18 @@ def test_a_walking_device_is_followed_without_loss(bundle: Path, tmp_path: Path)
     assert figures["farthest_px"] > 0.5
     assert figures["last_over_first"] > 0.95
     assert figures["position_error_px"] < 0.03
+
+
+def test_a_page_tells_its_piston_and_its_brightness(bundle: Path) -> None:
+    simulator = Simulator(PROFILE, Device().with_settings(["drift.shift_px=0", "drift.piston_rad=0.5"]), seed=3)
+    symbols = random_symbols(PROFILE, 256, 2, np.random.default_rng([3, 0]))
+    tracker = tracker_for(Decoder.load(bundle))
+    shown = [simulator.simulate(page) for page in symbols]
+    first, second = (tracker.decode(page.pair, 256) for page in shown)
+    walked = math.remainder(shown[1].piston - shown[0].piston, 2 * math.pi)
+    assert abs(walked) > 0.05
+    assert math.remainder(second.piston_rad - first.piston_rad - walked, 2 * math.pi) == pytest.approx(0, abs=0.02)
+    assert second.brightness == pytest.approx(1, abs=0.1)
 
 
 def test_a_damaged_golden_page_is_noticed(bundle: Path, tmp_path: Path) -> None:

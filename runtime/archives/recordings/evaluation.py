@@ -1,7 +1,7 @@
 """Measures a decoder on a recording with known symbols, on pages that it has not seen."""
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.layout import narrow, page_hashes
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.decoding_ahead import Shown, Symbols, decoded_ahead
+from lightpage.runtime.archives.recordings.drift import Drift, PageState, drift_of
 from lightpage.runtime.archives.recordings.refused import RefusedPage, refusal, refused_json
 from lightpage.runtime.model.bundle.manifest import GOLDEN
 from lightpage.runtime.model.decoding.decoder import Decoder
@@ -52,6 +53,7 @@ class Evaluation:
         pages_recalibration_due: pages whose pilots show that the device is no longer as it was calibrated.
         refused: pages that could not be decoded, or were not confirmed; no figure counts them.
         air_before_refit_bits_per_symbol: AIR with the smooth phase errors that decoding takes off still in.
+        drift: drift of the device over these pages, by the fields of `PageState`.
     """
 
     bundle_version: str
@@ -70,6 +72,7 @@ class Evaluation:
     refused: tuple[RefusedPage, ...] = ()
     air_before_refit_bits_per_symbol: float = float("nan")
     steps_per_page: float = 0.0
+    drift: dict[str, Drift] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         air = f"AIR {self.figures.air_bits_per_symbol:.3f} bits a symbol"
@@ -227,6 +230,7 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
     data = ~pilots_of(decoder, recording)
     accumulator = Accumulator(levels, data, recording.pages)
     timings: list[Timings] = []
+    states: list[PageState] = []
     refused: list[RefusedPage] = []
     due = 0
     before: list[float] = []
@@ -235,6 +239,7 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
         unfitted = (page.phase + page.phase_error)[data]
         before.append(float(achievable_rate(unfitted, page.concentration[data], symbols[data], levels).mean()))
         timings.append(page.timings)
+        states.append(PageState.of(page))
         due += page.check.recalibration_due
     if not timings and refused:
         told = refusal(f"recording {recording.path}", refused, recording.pages)
@@ -266,6 +271,7 @@ def evaluate(decoder: Decoder, recording: Recording, tracker: Tracker) -> Evalua
         refused=tuple(refused),
         air_before_refit_bits_per_symbol=float(np.mean(before)),
         steps_per_page=float(np.median([t.steps for t in timings])),
+        drift=drift_of(states),
     )
 
 

@@ -8,6 +8,7 @@ from lightpage.cli.options import JSON
 from lightpage.metrics.provenance import write_figures
 from lightpage.progress import warn
 from lightpage.recording.reader import Recording
+from lightpage.runtime.archives.recordings.drift import described, pages_until
 from lightpage.runtime.archives.recordings.evaluation import Evaluation, NothingReadError
 from lightpage.runtime.archives.recordings.evaluation import evaluate as evaluate_recording
 from lightpage.runtime.archives.recordings.refused import WORTH_NOTHING, refusal, unconfirmed
@@ -53,6 +54,7 @@ MANY = " (with so many levels, most wrong symbols are neighbours; the AIR is wha
 def describe(result: Evaluation) -> str:
     """The figures as a table for people."""
     figures = result.figures
+    to_pixel = pages_until(result.drift, 1.0)
     gmi, lost = figures.gmi_bits_per_symbol, unconfirmed(result.refused)
     rows = [
         ("bundle", result.bundle_version),
@@ -69,6 +71,11 @@ def describe(result: Evaluation) -> str:
         ("page", f"{result.page_kb:.3f} kB"),
         ("symbol error rate", f"{figures.symbol_error_rate:.4f}{MANY if figures.levels >= _MANY_LEVELS else ''}"),
         ("ECE", f"{figures.ece:.4f}"),
+        ("drift from page to page", described(result.drift) or "not shown"),
+        (
+            "image moves by 1 px",
+            "not shown" if to_pixel is None else f"in some {to_pixel:,} pages, as a random walk",
+        ),
         ("decode", f"{1e3 * result.seconds_per_page:.1f} ms a page (median)"),
     ]
-    return "\n".join(f"{name:<20} {value}" for name, value in rows)
+    return "\n".join(f"{name:<24} {value}" for name, value in rows)

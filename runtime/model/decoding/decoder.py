@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import cmath
+import math
 import time
 from dataclasses import replace
 from functools import cached_property
@@ -326,6 +328,8 @@ class Decoder:
         """Piston, crosstalk, smooth phase error, flicker, trust, decision: all behind the graph; timings are zero."""
         known, shown = pilots or self.pilots(levels), self.bundle.levels(levels)
         page = corrected(inference.phase, inference.concentration, shown, known, self.phase_refit)
+        gain = inference.gain
+        piston = page.reading.piston.angle_rad + (0.0 if gain is None else cmath.phase(gain))
         symbols, confidence = decide_with_confidence(page.phase, page.concentration, shown)
         return DecodedPage(
             symbols=symbols,
@@ -333,7 +337,8 @@ class Decoder:
             concentration=page.concentration,
             phase=page.phase,
             levels=levels,
-            piston_rad=page.reading.piston.angle_rad,
+            piston_rad=math.remainder(piston, 2 * math.pi),
+            brightness=math.nan if gain is None else abs(gain) ** 2,
             pilot_coherence=page.reading.piston.coherence,
             pilot_trust=page.reading.trust,
             check=page.reading.check,
@@ -397,7 +402,8 @@ def _inference(found: dict[str, NDArray[np.float32]], residual: str | None) -> I
     drift = np.concatenate([shift, tilt]).astype(np.float64)
     # the counts of a reference alone are as expected of a page without light
     has_light = bool(np.isfinite(found[RESIDUAL]).all())
-    return replace(page, drift=drift, residual=page.residual if has_light else np.nan)
+    gain = complex(*found["nuisance"][:2].astype(np.float64))
+    return replace(page, drift=drift, gain=gain, residual=page.residual if has_light else np.nan)
 
 
 def _like(decoder: Decoder, bundle: Bundle, graph: PageGraph) -> Decoder:

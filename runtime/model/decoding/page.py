@@ -46,8 +46,8 @@ class Inference:
     the homodyne equations over the field's, or of an estimator the mean square of the counts' residuals over their
     variance, not finite for frames without the light of a page. `waited_s` are the seconds for which the page waited
     for others of its batch. An estimator also says by what `drift` the page's light lies off the table, [4] as in
-    `lightpage.runtime.model.decoding.image_drift`, and its number of Gauss-Newton `steps`; there was no time for
-    `skipped_steps` more.
+    `lightpage.runtime.model.decoding.image_drift`, by what complex `gain` it has taken off the page's light, and its
+    number of Gauss-Newton `steps`; there was no time for `skipped_steps` more.
     """
 
     p: NDArray[np.float32]
@@ -56,6 +56,7 @@ class Inference:
     residual: float = 0.0
     waited_s: float = 0.0
     drift: NDArray[np.float64] | None = None
+    gain: complex | None = None
     steps: int = 0
     skipped_steps: int = 0
 
@@ -121,7 +122,7 @@ class DecodedPage:
         concentration: float32 [ny, nx], von Mises kappa as far as the pilots bear it out.
         phase: float32 [ny, nx], radians, piston removed.
         levels: M.
-        piston_rad: what was removed.
+        piston_rad: piston that was removed.
         pilot_coherence: how far the pilots agree on it, 0..1.
         pilot_trust: share of the network's claimed concentration that they bear out, 0..1; low after a drift.
         check: information that is claimed of the pilots, and what of it they confirm.
@@ -129,6 +130,7 @@ class DecodedPage:
         phase_error: float32 [ny, nx], smooth error and flicker that were taken off `phase`, radians.
         level_phases: phase that stands for each level, radians; None where level s is 2 pi s / M.
         image: where the image lies as this page shows it, None where it is not followed.
+        brightness: power of the page's light over that of the calibration's; NaN of a network's bundle.
         stroke_relative: what the pilots show of the modulator's stroke beyond its calibration; NaN where they show
             nothing of it.
     """
@@ -146,6 +148,7 @@ class DecodedPage:
     phase_error: NDArray[np.float32]
     level_phases: tuple[float, ...] | None = None
     image: ImagePosition | None = None
+    brightness: float = np.nan
     stroke_relative: float = np.nan
 
     def __repr__(self) -> str:
