@@ -34,6 +34,7 @@ def shown(data: ReportData) -> dict[str, Any]:
         "smooth": SMOOTH,
         "maps": figures.maps(data, centroids),
         "reliability": [figures.reliability(data), figures.concentration(data)],
+        "drift": figures.drift(data),
         "training": curves if curves is None or isinstance(curves, str) else figures.training(curves),
         "page": data.golden if isinstance(data.golden, str) else figures.page(data.golden),
         "rays": NOT_TRACED if paths is None else figures.rays(data, paths),

@@ -135,6 +135,41 @@ def reliability(data: ReportData) -> Picture:
     return as_picture(figure, f"Reliability diagram, ECE {data.measures.ece:.4f}.", caption)
 
 
+_DRIFTS = (
+    ("piston", "rad", ("piston_rad",)),
+    ("image", "px", ("image_x_px", "image_y_px")),
+    ("tilt", "rad", ("tilt_x_rad", "tilt_y_rad")),
+    ("stroke, brightness", "relative", ("stroke_relative", "brightness_relative")),
+)
+"""Panels of the drift: title, unit, and the quantities that they show, each since its first page."""
+
+
+def drift(data: ReportData) -> list[Picture]:
+    """Draw what drifts from page to page; none where it is not known."""
+    panels = [panel for panel in _DRIFTS if any(name in data.drift for name in panel[2])]
+    if not panels:
+        return []
+    figure = new_figure()
+    axes = np.atleast_1d(figure.subplots(len(panels), 1, sharex=True))
+    for axis, (title, unit, names) in zip(axes, panels, strict=True):
+        for name, colour in zip(names, (BLUE, ORANGE), strict=False):
+            if name in data.drift:
+                values = np.array(data.drift[name].values, np.float64)
+                shown = np.flatnonzero(np.isfinite(values))
+                what = name.rpartition("_")[0].replace("_", " ")
+                axis.plot(shown + 1, (values - values[shown[0]])[shown], color=colour, linewidth=1, label=what)
+        axis.set_ylabel(unit)
+        axis.set_title(title, loc="left")
+        if len(names) > 1:
+            axis.legend(frameon=False, loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0, ncols=2)
+    axes[-1].set_xlabel("measured page")
+    steps = ", ".join(
+        f"{name.rpartition('_')[0].replace('_', ' ')} {walk.step:.2g}" for name, walk in data.drift.items()
+    )
+    caption = f"Drift since the first page. Root mean square of the change from page to page: {steps}."
+    return [as_picture(figure, "Lines of the device's state over the pages.", caption)]
+
+
 def concentration(data: ReportData) -> Picture:
     """Draw promised concentrations against observed ones, as distances from a perfect cosine."""
     bins = data.concentration_bins

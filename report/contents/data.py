@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,6 +29,19 @@ class Golden:
 
     pair: FramePair
     phase: NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class Walk:
+    """Walk of a quantity from page to page.
+
+    Attributes:
+        values: its value on each page; None where a page does not show it.
+        step: root mean square of its change from a page to the next.
+    """
+
+    values: list[float | None]
+    step: float
 
 
 @dataclass(frozen=True)
@@ -63,6 +76,7 @@ class ReportData:
         confidence_bins, concentration_bins: claims against results.
         curves: curves of the training, by TensorBoard's tag, for each validation at the light; None of an evaluation.
         golden: golden page with its decoded phase.
+        drift: drift of the device over the measured pages by quantity; empty where it is not known.
     """
 
     title: str
@@ -77,6 +91,7 @@ class ReportData:
     concentration_bins: list[ConcentrationBin]
     curves: Sequence[Mapping[str, Curve]] | str | None
     golden: Golden | str
+    drift: Mapping[str, Walk] = field(default_factory=dict)
 
     @property
     def data(self) -> NDArray[np.bool_]:

@@ -20,7 +20,7 @@ from lightpage.metrics.reliability import ConcentrationBin, ConfidenceBin
 from lightpage.page.levels import MAX_LEVELS, MIN_LEVELS
 from lightpage.page.pilots import remove_piston
 from lightpage.recording.frame_pair import FramePair
-from lightpage.report.contents.data import Golden, Rays, ReportData
+from lightpage.report.contents.data import Golden, Rays, ReportData, Walk
 from lightpage.report.json_file import Bits, JsonFile, Part, Seconds, Share
 from lightpage.report.words import how_long
 from lightpage.words import counted
@@ -47,6 +47,11 @@ class _Bundle(Part):
     golden_piston_rad: float
 
 
+class _Walk(Part):
+    values: list[float | None]
+    step: Annotated[float, Field(ge=0)]
+
+
 class _Evaluation(Part):
     """The keys of the JSON that a report is made of."""
 
@@ -66,6 +71,7 @@ class _Evaluation(Part):
     maps: _Maps
     bundle: _Bundle
     refused_pages: list[dict[str, Any]]
+    drift: Annotated[dict[str, _Walk], Field(default_factory=dict)]
 
 
 class _PageCount(Part):
@@ -104,6 +110,7 @@ def report_of_evaluation(file: JsonFile) -> ReportData:
         concentration_bins=found.concentration_bins,
         curves=None,
         golden=_golden(bundle),
+        drift={name: Walk(walk.values, walk.step) for name, walk in found.drift.items()},
     )
 
 

@@ -105,7 +105,7 @@ def test_zones_add_up_and_the_pipe_angle_is_told_in_degrees(small_run: Path) -> 
 
 def test_an_evaluation_and_its_maps(evaluation: Path, tmp_path: Path) -> None:
     text, seen = page_of(evaluation, tmp_path / "E.html", "--json", tmp_path / "J")
-    check_whole(text, seen, [name for name in SECTIONS if name != "training"])
+    check_whole(text, seen, ["drift" if name == "training" else name for name in SECTIONS])
     assert json.loads((tmp_path / "J").read_text())["bytes"] == len(text.encode())
     found = json.loads(evaluation.read_text())
     maps = {name: np.array(rows, dtype=float) for name, rows in found["maps"].items()}
