@@ -442,6 +442,10 @@ def _other_symbols(pages: Sequence[KnownPage]) -> Iterator[tuple[str, KnownPage]
         yield f"the frames of known page {number} show those of page 0", KnownPage(page.pair, first.symbols)
         yield f"the frames of known page 0 show those of page {number}", KnownPage(first.pair, page.symbols)
     yield "the frames show the inverse levels, M - 1 - s for s", KnownPage(first.pair, first.symbols.conj())
+    by_columns = first.symbols.ravel().reshape(first.symbols.shape, order="F")
+    yield "the frames show symbols that run down the columns (transposed)", KnownPage(first.pair, by_columns)
+    by_rows = first.symbols.ravel(order="F").reshape(first.symbols.shape)
+    yield "the frames show symbols that run along the rows (transposed)", KnownPage(first.pair, by_rows)
     phases = np.mod(np.angle(first.symbols), 2 * np.pi)
     for factor in _OTHER_LEVELS:
         levels = f"{factor} times as many levels" if factor > 1 else f"1/{round(1 / factor)} of the levels"

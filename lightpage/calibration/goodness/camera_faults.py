@@ -31,6 +31,8 @@ _LEAST_CONSTANT = 0.03
 _LEAST_CONTRAST = 0.08
 _LEAST_BEND = 0.04
 """Least terms that are named. The resampling of frames makes up to 0.02 of a signal's factor."""
+_EXCHANGED = 0.02
+"""Largest deviation from 1 of the product of exchanged references' exposures."""
 _BLACK_SHARE = 0.25
 """Share of a black level, by the factor on v, that the noise of dark pixels must show."""
 _SPECK_PX = 2.0
@@ -113,6 +115,17 @@ def named_contrast(terms: list[CountTerms]) -> str:
     level = np.mean([each.contrast / (1 + each.contrast) for each in strong])
     black = np.mean([each.black for each in strong])
     return "black level" if black > _BLACK_SHARE * level or len(strong) < len(terms) else "vibration"
+
+
+def named_exposures(terms: list[CountTerms]) -> str:
+    """Exposure of both references over that of the pages, in words.
+
+    Where one is too long by as much as the other is too short, they may be exchanged.
+    """
+    in_phase, quadrature = (1 / (1 + each.constant) for each in terms)
+    exchanged = (in_phase - 1) * (quadrature - 1) < 0 and abs(in_phase * quadrature - 1) < _EXCHANGED
+    words = f"in-phase {in_phase:.3f}, quadrature {quadrature:.3f} times the pages'"
+    return f" ({words}{': as exchanged references would show' if exchanged else ''})"
 
 
 def contrast_bits(terms: list[CountTerms]) -> float:

@@ -24,6 +24,7 @@ from lightpage.calibration.goodness.camera_faults import (
     contrast_bits,
     count_terms,
     named_contrast,
+    named_exposures,
     named_shadows,
     shadows,
 )
@@ -47,6 +48,7 @@ from lightpage.calibration.goodness.remedies import (
     LEVELS,
     NEIGHBOURS,
     OTHER_SYMBOLS,
+    REFERENCE_EXPOSURE,
     UNKNOWN,
     VIBRATION,
     WALLS,
@@ -277,7 +279,7 @@ def _causes(
     unknown = lost * max(0.0, 1 - sum(variances.values()) / max(wrong, _TINY))
     foreign = np.mean(np.abs(errors) ** 2) > _FOREIGN
     bits[OTHER_SYMBOLS if foreign else UNKNOWN] = unknown
-    details = {DEAD_PIXELS: str(dead), DUST: named_shadows(dark)}
+    details = {DEAD_PIXELS: str(dead), DUST: named_shadows(dark), REFERENCE_EXPOSURE: named_exposures(page.terms)}
     if bits.get(WALLS, 0.0) >= _FITTED_BITS:
         width_um = 1e6 * light.waves.channel.geometry.pipe_width_m
         height, deviation = (width_um * each for each in relative_height(light))

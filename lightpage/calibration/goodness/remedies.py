@@ -28,6 +28,7 @@ CAMERA_PIXELS = "camera pixels"
 DUST = "dust"
 FLICKER = "flicker"
 DEAD_PIXELS = "dead modulator pixels"
+REFERENCE_EXPOSURE = "reference exposure"
 VIBRATION = "vibration"
 WALLS = "walls"
 
@@ -52,7 +53,7 @@ REMEDIES = {
     "taper": Remedy("a pipe that tapers", "ask the pipe's maker for the widths of both facets"),
     "ghost": Remedy("light that passes the pipe three times", "coat the facets against reflections, or wedge one"),
     CONTRAST: Remedy("a wrong ratio of interference and signal", "record references and pages alike"),
-    "reference exposure": Remedy(
+    REFERENCE_EXPOSURE: Remedy(
         "references of another exposure than the pages", "record references with the pages' exposure, each camera's own"
     ),
     "black level": Remedy(

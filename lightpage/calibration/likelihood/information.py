@@ -23,7 +23,7 @@ _DEVIATIONS = 4.0
 is not smoothed. That of other symbols varies with the light of the others, on a page of the bench device by 0.18."""
 _LEAST_SEEN = 0.9
 """Share of its light on both cameras below which rays tell that a symbol's light lies beside a camera."""
-_LEAST_BESIDE = 0.05
+_LEAST_BESIDE = 0.002
 """Least information of such a symbol, over the median about it. In the dimmest light it has a large error."""
 _MOST_SPREAD = 0.2
 """Largest standard deviation of the information about its median with which such symbols are told from chance."""
