@@ -50,6 +50,8 @@ class PageLight:
         fields: light that the model predicts for each camera.
         counts: frames minus references, over twice the references, [2, Gy, Gx].
         references: counts of the references, [2, Gy, Gx].
+        amplitude: amplitude of the reference over its mean, [Gy, Gx].
+        arms: phasors of both arms of the homodyne detector, [2, 1, 1].
         visible: places of the grid that both cameras see, [Gy, Gx].
         every: slices of the grid to the coarse grid.
         stride: samples of the grid from one of the coarse grid to the next.
@@ -93,8 +95,8 @@ class PageLight:
         ]
         self.references = interpolated(self._smooth_references, self.at)
         amplitude = np.sqrt(self.references[0])
-        self._amplitude = amplitude / amplitude[self.visible].mean()
-        self._arms = np.exp(1j * np.array([0.0, device.quadrature_phase_rad]))[:, None, None]
+        self.amplitude = amplitude / amplitude[self.visible].mean()
+        self.arms = np.exp(1j * np.array([0.0, device.quadrature_phase_rad]))[:, None, None]
         references = device.references
         differences = [
             pair.in_phase.astype(np.float32) - references.in_phase,
@@ -113,7 +115,7 @@ class PageLight:
 
     def observed_change(self, change: Complex) -> Complex:
         """Estimate a small change of both cameras' light from their equations, which miss its other quadrature."""
-        return self._explaining_light((change / self._amplitude * self._count_gradient().conj()).real)
+        return self._explaining_light((change / self.amplitude * self._count_gradient().conj()).real)
 
     def expected_frames(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Counts that the model predicts for both cameras' pixels, [H, W]; NaN beyond the common grid."""
@@ -179,21 +181,6 @@ class PageLight:
         )
         self.fields = waves.from_exit(waves.to_exit(self.page, transmission))
 
-    def residual_of(self, fields: Complex) -> Real:
-        """Residual of the equations on the coarse grid, flat, if the cameras' light were `fields` there.
-
-        The mean counts are corrected as by `correct_counts`.
-        """
-        field = fields / self._amplitude[self.every]
-        brightness = np.abs(self._arms + field) ** 2
-        visible = self.visible[self.every]
-        counts = self.counts[:, *self.every] - (brightness - 1) / 2
-        for camera, level in enumerate(self.references[:, *self.every]):
-            expected = level * brightness[camera]
-            curve = CountCurve.measured(expected[visible], counts[camera][visible])
-            counts[camera] -= curve.at(expected)
-        return self.equations(counts)
-
     def correct_counts(self) -> None:
         """Measure the mean count as a function of the expected count, and correct the model by it.
 
@@ -215,12 +202,12 @@ class PageLight:
 
     def equations_of(self, change: Complex) -> Real:
         """Change of the equations, flat, by a small change of both cameras' light on the coarse grid."""
-        return self.equations((change / self._amplitude[self.every] * self._count_gradient(self.every).conj()).real)
+        return self.equations((change / self.amplitude[self.every] * self._count_gradient(self.every).conj()).real)
 
     def interference_and_power(self) -> tuple[Real, Real]:
         """Interference and power of the predicted light, over the reference's power, [2, Gy, Gx] each."""
-        field = self.fields / self._amplitude
-        return np.asarray(2 * (field * self._arms.conj()).real), np.asarray(np.abs(field) ** 2)
+        field = self.fields / self.amplitude
+        return np.asarray(2 * (field * self.arms.conj()).real), np.asarray(np.abs(field) ** 2)
 
     @property
     def brightness(self) -> Real:
@@ -247,17 +234,17 @@ class PageLight:
     @property
     def count_residual(self) -> Real:
         """Measured minus predicted counts, over twice the reference's, [2, Gy, Gx]."""
-        field = self.fields / self._amplitude
-        return np.asarray(self.counts - self._excess - (field * self._arms.conj()).real - np.abs(field) ** 2 / 2)
+        field = self.fields / self.amplitude
+        return np.asarray(self.counts - self._excess - (field * self.arms.conj()).real - np.abs(field) ** 2 / 2)
 
     def _count_gradient(self, where: tuple[slice, slice] = _EVERYWHERE) -> Complex:
         """Gradient of the cameras' counts by the field, at some places of the grid."""
-        return np.asarray(self._arms + self.fields[:, *where] / self._amplitude[where])
+        return np.asarray(self.arms + self.fields[:, *where] / self.amplitude[where])
 
     def _explaining_light(self, residual: Real) -> Complex:
         """Light of both cameras that explains residuals of their equations [2, Gy, Gx], weighted by their noise."""
         gradient = self._count_gradient()
-        return np.asarray(self.visible * self._amplitude * gradient * residual / (np.abs(gradient) ** 2 + READ_NOISE))
+        return np.asarray(self.visible * self.amplitude * gradient * residual / (np.abs(gradient) ** 2 + READ_NOISE))
 
 
 def places_on_facet(waves: FittedWaves) -> tuple[Real, Real]:

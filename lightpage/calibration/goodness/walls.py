@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lightpage.calibration.goodness.equations import equations_of_fit
+from lightpage.calibration.goodness.frame_noise import CountCurve
 from lightpage.calibration.goodness.light import PageLight
 from lightpage.calibration.parameters import PARAMETERS, PRIORS, SEEN_BY_CAMERAS, STEPS
 from lightpage.calibration.waves.wave_fit import inverse_of_information
@@ -51,14 +52,14 @@ def relative_height(light: PageLight) -> RelativeHeight:
     lit = [light.coarse.to_cameras(page * term) for term in illumination_terms(light.waves.x, light.waves.y)]
     by_illumination = [light.equations_of(factor * each) for each in lit for factor in (1, 1j)]
     best = np.append(light.device.parameters, 0.0)
-    fewest = float(np.mean(light.residual_of(light.fields[:, *light.every]) ** 2))
+    fewest = float(np.mean(_residual(light, light.fields[:, *light.every]) ** 2))
     damping = _DAMPING
     deviation = 0.0
     for _ in range(_ROUNDS):
         fields = _fields(light, best)
         columns = [(_fields(light, moved) - fields) / step for moved, step in _steps(best, of_light)]
         matrix = np.stack([*map(light.equations_of, columns), *by_illumination, *by_cameras], axis=1)
-        right = light.residual_of(offset + fields)
+        right = _residual(light, offset + fields)
         precision = np.zeros(matrix.shape[1])
         precision[: len(of_light)] = fewest / PRIORS[of_light] ** 2
         gradient = matrix.T @ right
@@ -68,12 +69,28 @@ def relative_height(light: PageLight) -> RelativeHeight:
         step = inverse_of_information(normal + damping * np.diag(np.diag(normal))) @ gradient
         moved = best.copy()
         moved[[*of_light, -1]] += step[: len(of_light) + 1]
-        noise = float(np.mean(light.residual_of(offset + _fields(light, moved)) ** 2))
+        noise = float(np.mean(_residual(light, offset + _fields(light, moved)) ** 2))
         if noise < fewest:
             best, fewest, damping = moved, noise, damping / 10
         else:
             damping *= 10
     return RelativeHeight(float(best[-1]), deviation)
+
+
+def _residual(light: PageLight, fields: Complex) -> Real:
+    """Residual of the equations on the coarse grid, flat, if the cameras' light were `fields` there.
+
+    The mean counts are corrected as by `PageLight.correct_counts`.
+    """
+    field = fields / light.amplitude[light.every]
+    brightness = np.abs(light.arms + field) ** 2
+    visible = light.visible[light.every]
+    counts = light.counts[:, *light.every] - (brightness - 1) / 2
+    for camera, level in enumerate(light.references[:, *light.every]):
+        expected = level * brightness[camera]
+        curve = CountCurve.measured(expected[visible], counts[camera][visible])
+        counts[camera] -= curve.at(expected)
+    return light.equations(counts)
 
 
 def _fields(light: PageLight, parameters: Real) -> Complex:

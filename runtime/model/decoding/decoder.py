@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import cmath
-import math
 import time
 from dataclasses import replace
 from functools import cached_property
@@ -68,8 +66,7 @@ class Decoder:
 
     Raises:
         ProviderError: there is no such provider here.
-        BundleError: the graph is not a decoder of this profile, table or pilots do not fit it, or the golden page
-            comes out differently.
+        BundleError: graph, table or pilots do not fit the profile, or the golden page comes out differently.
     """
 
     def __init__(
@@ -328,8 +325,6 @@ class Decoder:
         """Piston, crosstalk, smooth phase error, flicker, trust, decision: all behind the graph; timings are zero."""
         known, shown = pilots or self.pilots(levels), self.bundle.levels(levels)
         page = corrected(inference.phase, inference.concentration, shown, known, self.phase_refit)
-        gain = inference.gain
-        piston = page.reading.piston.angle_rad + (0.0 if gain is None else cmath.phase(gain))
         symbols, confidence = decide_with_confidence(page.phase, page.concentration, shown)
         return DecodedPage(
             symbols=symbols,
@@ -337,8 +332,8 @@ class Decoder:
             concentration=page.concentration,
             phase=page.phase,
             levels=levels,
-            piston_rad=math.remainder(piston, 2 * math.pi),
-            brightness=math.nan if gain is None else abs(gain) ** 2,
+            piston_rad=inference.whole_piston(page.reading.piston.angle_rad),
+            brightness=inference.brightness,
             pilot_coherence=page.reading.piston.coherence,
             pilot_trust=page.reading.trust,
             check=page.reading.check,

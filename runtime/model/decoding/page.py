@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import cmath
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -59,6 +61,16 @@ class Inference:
     gain: complex | None = None
     steps: int = 0
     skipped_steps: int = 0
+
+    @property
+    def brightness(self) -> float:
+        """Power of the page's light over that of the calibration's; NaN of a network's bundle."""
+        return math.nan if self.gain is None else abs(self.gain) ** 2
+
+    def whole_piston(self, angle_rad: float) -> float:
+        """Piston of the page, radians, whose phases have a common angle."""
+        taken_off = 0.0 if self.gain is None else cmath.phase(self.gain)
+        return math.remainder(angle_rad + taken_off, 2 * math.pi)
 
     def turned(self, by: NDArray[np.floating]) -> Inference:
         """The same with `by` (radians [ny, nx]) added to the phases."""

@@ -33,6 +33,6 @@ def test_a_walk_of_a_pixel_takes_as_many_pages_as_its_steps_say() -> None:
 
 def test_pages_that_show_nothing_keep_their_place() -> None:
     first, second, third = states(3)
-    drift = drift_of([first, second._replace(image_x_px=NAN), third])
+    drift = drift_of([first, PageState(*second[:1], NAN, *second[2:]), third])
     assert drift["image_x_px"].values == (first.image_x_px, None, third.image_x_px)
     assert drift_of([first]) == {}
