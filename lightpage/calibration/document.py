@@ -14,7 +14,8 @@ from pydantic import AfterValidator, Field, field_serializer
 from lightpage.calibration.calibrate import Registered
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.goodness.causes import unlike_profile
-from lightpage.calibration.goodness.verdict import GOOD, NOT_JUDGED, USABLE, Goodness, Reading
+from lightpage.calibration.goodness.remedies import UNKNOWN
+from lightpage.calibration.goodness.verdict import GOOD, GOOD_SHARE, NOT_JUDGED, USABLE, Goodness, Reading
 from lightpage.calibration.likelihood.statistics import Statistics
 from lightpage.calibration.parameters import KNOWN, NAMES, as_dict, as_vector
 from lightpage.device.profile import Count, Finite, Profile, TomlTable, to_toml, validate
@@ -269,7 +270,9 @@ class Calibration(TomlTable):
             return self.model_copy(update={"goodness": judged, "reading": reading})
         lost = max(0.0, reading.light_bits - reading.air_bits)
         other_profile = unlike_profile(self.vector)
-        if verdict == "good" and other_profile:
+        named = sum(cause.bits for cause in goodness.causes if cause.name != UNKNOWN)
+        # what looks like noise of the modulator lowers the information of the light as well
+        if verdict == "good" and (other_profile or named > (1 - GOOD_SHARE) * reading.light_bits):
             verdict = "usable"
         cause = other_profile if verdict == "good" else goodness.cause
         judged = goodness.model_copy(update={"verdict": verdict, "bits_lost": lost, "cause": cause})

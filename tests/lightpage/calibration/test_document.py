@@ -224,3 +224,11 @@ def test_causes_are_read_back_as_they_were_written(calibration: Calibration) -> 
     goodness = UNEXPLAINED.model_copy(update={"causes": (cause, cause_of("unknown", 0.1))})
     named = calibration.model_copy(update={"goodness": goodness})
     assert parse_calibration(named.to_toml()) == named
+
+
+@pytest.mark.parametrize(("bits", "verdict"), [(0.2, "good"), (0.5, "usable")])
+def test_causes_that_cost_much_make_no_good_fit(calibration: Calibration, bits: float, verdict: str) -> None:
+    goodness = UNEXPLAINED.model_copy(update={"causes": (cause_of("crosstalk", bits), cause_of("unknown", 2.0))})
+    judged = calibration.model_copy(update={"goodness": goodness}).judged(READ)
+    assert judged.goodness is not None
+    assert judged.goodness.verdict == verdict
