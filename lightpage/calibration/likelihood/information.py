@@ -25,6 +25,8 @@ _LEAST_SEEN = 0.9
 """Share of its light on both cameras below which rays tell that a symbol's light lies beside a camera."""
 _LEAST_BESIDE = 0.002
 """Least information of such a symbol, over the median about it. In the dimmest light it has a large error."""
+_MOST_SPREAD_BESIDE = 0.5
+"""Largest standard deviation of the information with which such symbols keep their own."""
 _MOST_SPREAD = 0.2
 """Largest standard deviation of the information about its median with which such symbols are told from chance."""
 _DAMPING = 2.0
@@ -101,7 +103,7 @@ def _smoothed(information: Real, seen: Real) -> Real:
     relative = information / np.where(usual > 0, usual, 1)
     spread = scipy.stats.median_abs_deviation(relative, axis=None, scale="normal")
     dark = (relative < 1 - _DEVIATIONS * spread) & (spread <= _MOST_SPREAD)
-    beside = (seen < _LEAST_SEEN) & (relative < 1)
+    beside = (seen < _LEAST_SEEN) & (relative < 1) & (spread <= _MOST_SPREAD_BESIDE)
     information = np.where(beside, np.maximum(information, _LEAST_BESIDE * usual), information)
     dark |= beside
     total = scipy.ndimage.gaussian_filter(np.where(dark, 0, information), _SMOOTHED)

@@ -144,7 +144,7 @@ def test_what_was_found_is_written_as_json(tmp_path: Path, monkeypatch: pytest.M
     phase = np.pi * data["axial_mm"]["modulator"] / 1e3 * wall_m**2
     phase /= profile.light.wavelength_m * profile.lens.focal_length_m**2
     assert phase == pytest.approx(calibration.parameters["modulator_axial_rad"])
-    assert data["goodness"] == EXPLAINED.model_copy(update={"verdict": "not judged"}).model_dump()
+    assert data["goodness"] == EXPLAINED.model_copy(update={"verdict": "not judged"}).model_dump(mode="json")
     assert data["reading"] is None
 
 
