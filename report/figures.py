@@ -156,6 +156,8 @@ def drift(data: ReportData) -> list[Picture]:
             if name in data.drift:
                 values = np.array(data.drift[name].values, np.float64)
                 shown = np.flatnonzero(np.isfinite(values))
+                if not shown.size:
+                    continue
                 what = name.rpartition("_")[0].replace("_", " ")
                 axis.plot(shown + 1, (values - values[shown[0]])[shown], color=colour, linewidth=1, label=what)
         axis.set_ylabel(unit)
@@ -163,9 +165,7 @@ def drift(data: ReportData) -> list[Picture]:
         if len(names) > 1:
             axis.legend(frameon=False, loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0, ncols=2)
     axes[-1].set_xlabel("measured page")
-    steps = ", ".join(
-        f"{name.rpartition('_')[0].replace('_', ' ')} {walk.step:.2g}" for name, walk in data.drift.items()
-    )
+    steps = ", ".join(f"{name.replace('_', ' ')} {walk.step:.2g}" for name, walk in data.drift.items())
     caption = f"Drift since the first page. Root mean square of the change from page to page: {steps}."
     return [as_picture(figure, "Lines of the device's state over the pages.", caption)]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 
 import numpy as np
 
@@ -58,10 +59,12 @@ def losses(calibration: Calibration) -> str:
         return ""
     lines = ["lost, bits a symbol, estimated:"]
     for cause in causes:
-        lines += [f"{cause.bits:>8.3f}  {cause.what}", f"{'':>10}remedy: {cause.remedy}"]
+        for first, text in ((f"{cause.bits:>8.3f}  ", cause.what), (f"{'':>10}remedy: ", cause.remedy)):
+            lines += textwrap.wrap(text, _COLUMNS, initial_indent=first, subsequent_indent=f"{'':>10}")
     return "\n".join(lines)
 
 
+_COLUMNS = 118
 _AXIAL = tuple(NAMES[index] for index in indices("axial"))
 _UNITS = frozenset({"m", "rad", "px", "deg", "relative"})
 

@@ -298,7 +298,8 @@ def check_agreement(coherences: Sequence[float]) -> None:
 def _by_modulator(found: Registered) -> bool:
     """Return whether bits are lost by what the modulator shows: no other place of the cameras explains that."""
     causes = found.goodness.causes if found.goodness is not None else ()
-    return bool(causes) and causes[0].name in (LEVELS, NEIGHBOURS)
+    by_modulator = sum(cause.bits for cause in causes if cause.name in (LEVELS, NEIGHBOURS))
+    return by_modulator > sum(cause.bits for cause in causes) / 2
 
 
 def _bits_lost(found: Registered) -> float:

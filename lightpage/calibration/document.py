@@ -14,7 +14,7 @@ from pydantic import AfterValidator, Field, field_serializer
 from lightpage.calibration.calibrate import Registered
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.goodness.causes import unlike_profile
-from lightpage.calibration.goodness.remedies import UNKNOWN
+from lightpage.calibration.goodness.remedies import UNKNOWN, largest
 from lightpage.calibration.goodness.verdict import GOOD, GOOD_SHARE, NOT_JUDGED, USABLE, Goodness, Reading
 from lightpage.calibration.likelihood.statistics import Statistics
 from lightpage.calibration.parameters import KNOWN, NAMES, as_dict, as_vector
@@ -219,8 +219,8 @@ class Calibration(TomlTable):
     def of_refit(self, goodness: Goodness | None) -> Goodness | None:
         """Goodness of a re-fit that started here, by the light that it leaves unexplained.
 
-        Pages that were read have judged a device whose light the model does not explain. An estimate does not call its
-        re-fit wrong.
+        Where pages that were read have judged the device, or nothing has, an estimate does not call its re-fit wrong:
+        held-back pages judge it.
         """
         judged = self.reading is not None or (self.goodness is not None and self.goodness.verdict == NOT_JUDGED)
         if goodness is None or goodness.verdict != "wrong" or not judged:
@@ -274,7 +274,7 @@ class Calibration(TomlTable):
         # what looks like noise of the modulator lowers the information of the light as well
         if verdict == "good" and (other_profile or named > (1 - GOOD_SHARE) * reading.light_bits):
             verdict = "usable"
-        cause = other_profile if verdict == "good" else goodness.cause
+        cause = "" if verdict == "good" else other_profile or goodness.cause or largest(goodness.causes)
         judged = goodness.model_copy(update={"verdict": verdict, "bits_lost": lost, "cause": cause})
         return self.model_copy(update={"goodness": judged, "reading": reading})
 

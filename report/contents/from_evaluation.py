@@ -49,7 +49,7 @@ class _Bundle(Part):
 
 class _Walk(Part):
     values: list[float | None]
-    step: Annotated[float, Field(ge=0)]
+    step: Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 class _Evaluation(Part):

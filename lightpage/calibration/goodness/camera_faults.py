@@ -23,6 +23,8 @@ Image = NDArray[np.float32]
 CONTRAST = "contrast"
 _BRIGHT = 0.7
 """Least expected count of a pixel that is fitted, over the reference's."""
+_FEWEST = 100
+"""Least number of pixels that terms are fitted to."""
 _CORRELATED = 3.0
 """Variance of the fitted terms over that of as many independent equations."""
 _DEVIATIONS = 5.0
@@ -53,7 +55,7 @@ class CountTerms(NamedTuple):
     """Terms of one camera's counts beyond those of an ideal camera.
 
     Attributes:
-        constant: counts over those of the reference, where there is neither interference nor signal.
+        constant: excess of the counts, relative to the reference's, where there is neither interference nor signal.
         contrast: relative excess of the signal's power over the square of its interference.
         bend: term of second order, over the reference's counts at the brightest ones.
         deviations: standard deviations of these three, [3].
@@ -78,6 +80,9 @@ def count_terms(light: PageLight) -> list[CountTerms]:
     frames = (light.pair.in_phase, light.pair.quadrature)
     for camera, (frame, expected) in enumerate(zip(frames, light.expected_frames(), strict=True)):
         bright = light.visible & (light.brightness[camera] > _BRIGHT)
+        if np.count_nonzero(bright) < _FEWEST:
+            terms.append(CountTerms(0.0, 0.0, 0.0, np.full(3, np.inf), 0.0))
+            continue
         interference, power = (part[camera][bright] for part in light.interference_and_power())
         brightness = 1 + interference + power
         level = light.references[camera][bright]
@@ -109,7 +114,7 @@ def named_contrast(terms: list[CountTerms]) -> str:
     """Name the cause of a wrong ratio of interference and signal; empty where the terms show none."""
     if all(each.exceeds(0, _LEAST_CONSTANT) for each in terms):
         return "reference exposure"
-    strong = [each for each in terms if each.exceeds(1, _LEAST_CONTRAST)]
+    strong = [each for each in terms if each.contrast > 0 and each.exceeds(1, _LEAST_CONTRAST)]
     if not strong:
         return "bend" if any(each.exceeds(2, _LEAST_BEND) for each in terms) else ""
     level = np.mean([each.contrast / (1 + each.contrast) for each in strong])

@@ -75,6 +75,7 @@ def shares_of(
     local = {name: where for name, where in places.items() if where.any() and not where.all()}
     shares: dict[str, float] = {}
     while len(shares) < _MOST_CAUSES:
+        bases = {name: basis for name, basis in bases.items() if basis.shape[1]}
         gains = {name: _gain(basis, residual, chance) for name, basis in bases.items()}
         gains |= {name: _local_gain(where, residual) for name, where in local.items()}
         best = max(gains, key=lambda name: gains[name], default="")
@@ -86,7 +87,9 @@ def shares_of(
             residual = np.where(where, 0, residual)
             chance = np.where(where, 0, chance)
             bases = {name: basis * ~where[:, None] for name, basis in bases.items()}
-            bases = {name: _orthonormal(fitted[:, :0], list(basis.T)) for name, basis in bases.items()}
+            fitted = np.asarray(scipy.linalg.orth(fitted * ~where[:, None], rcond=_RANK))
+            residual, chance = (_orthogonal_part(fitted, each) for each in (residual, chance))
+            bases = {name: _orthonormal(fitted, list(basis.T)) for name, basis in bases.items()}
         else:
             basis = bases.pop(best)
             residual = _orthogonal_part(basis, residual)

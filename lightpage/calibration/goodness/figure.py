@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import textwrap
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -13,6 +15,8 @@ from lightpage.calibration.goodness.verdict import Goodness, Map
 
 _SIZE = (7.2, 3.1)
 """Inches."""
+_COLUMNS = 110
+"""Letters of a line of the title."""
 _MOST = 30.0
 """Largest ratio of the colour scale."""
 
@@ -28,7 +32,7 @@ def goodness_figure(goodness: Goodness) -> Figure:
     bar.set_ticks([1, 3, 10, _MOST], labels=["1, noise", "3", "10", f"{_MOST:g}"])
     bar.ax.minorticks_off()
     what = f"{goodness.verdict}: about {goodness.bits_lost:.2f} bit a symbol lost"
-    figure.suptitle("\n".join(line for line in (what, goodness.cause) if line), fontsize=9)
+    figure.suptitle("\n".join([what, *textwrap.wrap(goodness.cause, _COLUMNS)]), fontsize=9)
     return figure
 
 

@@ -53,6 +53,7 @@ from lightpage.calibration.goodness.remedies import (
     VIBRATION,
     WALLS,
     cause_of,
+    largest,
 )
 from lightpage.calibration.goodness.verdict import GOOD, USABLE, Cause, Goodness, Map
 from lightpage.calibration.goodness.walls import relative_height
@@ -82,8 +83,6 @@ _MOST_RATIO = 1e6
 """Largest ratio in the maps."""
 _FOREIGN = 0.1
 """Least mean square of the symbols' relative errors that shows the light of other symbols."""
-_LEAST_SHARE = 0.2
-"""Least share of what is lost that the largest cause makes, to be called the likeliest one."""
 _FITTED_BITS = 0.02
 """Least information that unequal walls cost, bits a symbol, for their distance to be fitted."""
 _LEAST_BITS = 0.005
@@ -182,7 +181,9 @@ def measure_goodness(
     causes: tuple[Cause, ...] = ()
     if lost >= explained_from or contrast_bits(page.terms) >= explained_from:
         causes = _causes(twin, pages, page, errors, by_symbols, unexplained, drawn, amount, gains)
-    cause = other_profile or (_sentence(causes) if lost >= GOOD else "")
+    if lost >= GOOD and not causes:
+        causes = (cause_of(UNKNOWN, lost),)
+    cause = other_profile or (largest(causes) if lost >= GOOD else "")
     return Goodness(
         verdict="good" if lost < GOOD and not cause else "usable" if lost < USABLE else "wrong",
         bits_lost=lost,
@@ -251,7 +252,8 @@ def _causes(
     every = [page, *(_page_errors(twin, other) for other in pages[1:])]
     kept, flicker = without_flicker([each.errors for each in every], [each.phases for each in every])
     kept = [without_levels(each, one.phases).residual for each, one in zip(kept, every, strict=True)]
-    dead = dead_pixels(kept, float(np.mean(drawn.imag**2)))
+    variance = max(float(np.mean(drawn.imag**2)), _TINY)
+    dead = dead_pixels(kept, variance)
     variances = {name: each.variance for name, each in by_symbols.items()}
     variances |= {FLICKER: flicker, LEVELS: max(0.0, variances[LEVELS] - flicker)}
     light = page.light
@@ -270,7 +272,6 @@ def _causes(
     for name, share in shares.items():
         variances[contrast or CONTRAST if name == CONTRAST else name] = share * rest
     wrong = sum(variances.values()) + max(0.0, rest * (1 - sum(shares.values())))
-    variance = float(np.mean(drawn.imag**2))
     lost = max(0.0, lost_bits(np.where(dead.where, 0, page.errors), variance) - lost_bits(drawn, variance))
     bits = {name: lost * each / max(wrong, _TINY) for name, each in variances.items()}
     bits[DEAD_PIXELS] = dead.bits
@@ -298,18 +299,6 @@ def _frames_of(
     """Frames of one camera, and the counts that the model expects of them."""
     frames = [(page.light.pair.in_phase, page.light.pair.quadrature)[camera] for page in pages]
     return frames, [page.light.expected_frames()[camera] for page in pages]
-
-
-def _sentence(causes: Sequence[Cause]) -> str:
-    """Largest cause in words, with its share of what is lost; empty where there is none.
-
-    Where all named causes together are little, it is that the cause is unknown.
-    """
-    total = sum(cause.bits for cause in causes)
-    if not total:
-        return ""
-    shown = causes[0] if causes[0].bits >= _LEAST_SHARE * total else causes[-1]
-    return f"{shown.what} ({shown.bits / total:.0%} of what is lost)"
 
 
 def _smooth(errors: NDArray[np.floating]) -> NDArray[np.floating]:

@@ -44,7 +44,7 @@ class DeadPixels(NamedTuple):
 
     Attributes:
         where: symbols, [ny, nx].
-        power: mean square of their errors, over all symbols.
+        power: mean square of their errors of phase, over all symbols.
         bits: information that they lose, bits a symbol of the page.
     """
 
@@ -151,5 +151,5 @@ def dead_pixels(errors: Sequence[Complex], noise: float) -> DeadPixels:
     where = magnitude > max(_OUTLIER * usual, _LEAST_ERROR)
     if len(errors) < 2 or np.mean(where) > _MOST_DEAD:
         where = np.zeros_like(where)
-    wrong = np.where(where, np.abs(errors[0]) ** 2, 0)
+    wrong = np.where(where, errors[0].imag ** 2, 0)
     return DeadPixels(where, float(np.mean(wrong)), float(np.mean(np.log2(1 + wrong / noise))) / 2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from lightpage.calibration.goodness.camera_faults import CONTRAST
@@ -87,6 +88,20 @@ REMEDIES = {
         "a flat field or a trained network reads part of it",
     ),
 }
+
+
+_LEAST_SHARE = 0.2
+"""Least share of what is lost that the named causes make, for the largest of them to be called the likeliest."""
+
+
+def largest(causes: Sequence[Cause]) -> str:
+    """Largest named cause in words, with its share of what is lost; the unknown one where the others are little."""
+    total = sum(cause.bits for cause in causes)
+    if not total:
+        return ""
+    named = [cause for cause in causes if cause.name != UNKNOWN]
+    shown = causes[0] if sum(cause.bits for cause in named) >= _LEAST_SHARE * total else causes[-1]
+    return f"{shown.what} ({shown.bits / total:.0%} of what is lost)"
 
 
 def cause_of(name: str, bits: float, detail: str = "") -> Cause:

@@ -100,7 +100,8 @@ class Goodness(TomlTable):
         by_page: power of the residual over that of noise, in blocks over the page, rows from the top; 1 is noise alone.
         by_facet: the same over the pipe's exit facet.
         cause: largest cause, in words; empty where nothing is wrong.
-        causes: causes of what is lost, the largest first; empty where little is lost, and in documents of before.
+        causes: causes of what is lost, the largest first, and what is unknown last; empty where none was found, and in
+            documents of before.
     """
 
     verdict: Verdict

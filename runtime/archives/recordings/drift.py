@@ -56,7 +56,7 @@ class Drift:
 
     Attributes:
         values: its value on each page, that of the piston unwrapped; None where a page does not show it.
-        step: root mean square of its change from a page to the next.
+        step: root mean square of its change from a page to the next that was read.
         range: difference between its largest and its smallest value.
     """
 

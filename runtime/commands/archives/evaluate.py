@@ -74,7 +74,7 @@ def describe(result: Evaluation) -> str:
         ("drift from page to page", described(result.drift) or "not shown"),
         (
             "image moves by 1 px",
-            "not shown" if to_pixel is None else f"in some {to_pixel:,} pages, as a random walk",
+            "not in sight" if to_pixel is None else f"in some {to_pixel:,} pages, as a random walk",
         ),
         ("decode", f"{1e3 * result.seconds_per_page:.1f} ms a page (median)"),
     ]
