@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from lightpage.calibration.document import Calibration
 from lightpage.device.lenses import LensPrescription
@@ -16,6 +17,7 @@ from lightpage.metrics.information import page_kilobytes
 from lightpage.metrics.measures import PageMeasures, SymbolMaps
 from lightpage.metrics.reliability import ConcentrationBin, ConfidenceBin
 from lightpage.recording.frame_pair import FramePair
+from lightpage.report.json_file import Part
 
 if TYPE_CHECKING:
     from lightpage.train.fitting.curves import Curve
@@ -31,8 +33,7 @@ class Golden:
     phase: NDArray[np.floating]
 
 
-@dataclass(frozen=True)
-class Walk:
+class Walk(Part):
     """Walk of a quantity from page to page.
 
     Attributes:
@@ -41,7 +42,7 @@ class Walk:
     """
 
     values: list[float | None]
-    step: float
+    step: Annotated[float, Field(ge=0)]
 
 
 @dataclass(frozen=True)

@@ -47,11 +47,6 @@ class _Bundle(Part):
     golden_piston_rad: float
 
 
-class _Walk(Part):
-    values: list[float | None]
-    step: Annotated[float, Field(ge=0, allow_inf_nan=False)]
-
-
 class _Evaluation(Part):
     """The keys of the JSON that a report is made of."""
 
@@ -71,7 +66,7 @@ class _Evaluation(Part):
     maps: _Maps
     bundle: _Bundle
     refused_pages: list[dict[str, Any]]
-    drift: Annotated[dict[str, _Walk], Field(default_factory=dict)]
+    drift: Annotated[dict[str, Walk], Field(default_factory=dict)]
 
 
 class _PageCount(Part):
@@ -110,7 +105,7 @@ def report_of_evaluation(file: JsonFile) -> ReportData:
         concentration_bins=found.concentration_bins,
         curves=None,
         golden=_golden(bundle),
-        drift={name: Walk(walk.values, walk.step) for name, walk in found.drift.items()},
+        drift=found.drift,
     )
 
 

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from lightpage.calibration.goodness.frame_noise import noise_curve
 from lightpage.calibration.goodness.light import PageLight
+from lightpage.calibration.goodness.remedies import BEND, BLACK_LEVEL, REFERENCE_EXPOSURE, VIBRATION
 from lightpage.words import counted
 
 Real = NDArray[np.float64]
 Image = NDArray[np.float32]
 
-CONTRAST = "contrast"
 _BRIGHT = 0.7
 """Least expected count of a pixel that is fitted, over the reference's."""
 _FEWEST = 100
@@ -113,13 +113,13 @@ def _black_level(frame: NDArray[np.integer], expected: Image) -> float:
 def named_contrast(terms: list[CountTerms]) -> str:
     """Name the cause of a wrong ratio of interference and signal; empty where the terms show none."""
     if all(each.exceeds(0, _LEAST_CONSTANT) for each in terms):
-        return "reference exposure"
+        return REFERENCE_EXPOSURE
     strong = [each for each in terms if each.contrast > 0 and each.exceeds(1, _LEAST_CONTRAST)]
     if not strong:
-        return "bend" if any(each.exceeds(2, _LEAST_BEND) for each in terms) else ""
+        return BEND if any(each.exceeds(2, _LEAST_BEND) for each in terms) else ""
     level = np.mean([each.contrast / (1 + each.contrast) for each in strong])
     black = np.mean([each.black for each in strong])
-    return "black level" if black > _BLACK_SHARE * level or len(strong) < len(terms) else "vibration"
+    return BLACK_LEVEL if black > _BLACK_SHARE * level or len(strong) < len(terms) else VIBRATION
 
 
 def named_exposures(terms: list[CountTerms]) -> str:

@@ -13,10 +13,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from lightpage.calibration.goodness.camera_faults import CONTRAST
 from lightpage.calibration.goodness.equations import coarse_places, equations_of_contrast, equations_of_fit
 from lightpage.calibration.goodness.light import PageLight, places_on_facet, radius2
-from lightpage.calibration.goodness.remedies import NEIGHBOURS, WALLS
+from lightpage.calibration.goodness.remedies import CONTRAST, NEIGHBOURS, WALLS
 from lightpage.calibration.parameters import NAMES, PRIORS, indices
 
 Real = NDArray[np.float64]
@@ -132,8 +131,11 @@ def _orthogonal_part(fitted: Real, column: Real) -> Real:
 
 def _suspects(light: PageLight) -> Iterator[tuple[str, list[Real]]]:
     """Yield each possible cause with the columns by which it would change the equations."""
-    coarse, page = light.coarse, light.page
-    leaving, (across, up), squares = coarse.to_exit(page), places_on_facet(coarse), radius2(coarse)
+    coarse = light.coarse
+    page = light.page
+    leaving = coarse.to_exit(page)
+    across, up = places_on_facet(coarse)
+    squares = radius2(coarse)
     one = np.array([1, 0])[:, None, None]
 
     def at_exit(factor: Real) -> list[Real]:
@@ -146,7 +148,8 @@ def _suspects(light: PageLight) -> Iterator[tuple[str, list[Real]]]:
     yield "lens askew", [*at_exit(across**2 - up**2), *at_exit(across * up)]
     entering = coarse.from_exit(coarse.to_exit(page, 1j * squares))
     yield "modulator focus", [light.equations_of(entering)]
-    x, y = light.waves.x[None, :], light.waves.y[:, None]
+    x = light.waves.x[None, :]
+    y = light.waves.y[:, None]
     bent = [light.equations_of(coarse.to_cameras(1j * page * x**i * y**j)) for i, j in _BENDS]
     yield "modulator bent", bent
     here = coarse.from_exit(leaving)

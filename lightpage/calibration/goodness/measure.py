@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.goodness.camera_faults import (
-    CONTRAST,
     CountTerms,
     contrast_bits,
     count_terms,
@@ -42,6 +41,7 @@ from lightpage.calibration.goodness.page_errors import (
 )
 from lightpage.calibration.goodness.remedies import (
     CAMERA_PIXELS,
+    CONTRAST,
     DEAD_PIXELS,
     DUST,
     FLICKER,
@@ -51,12 +51,10 @@ from lightpage.calibration.goodness.remedies import (
     REFERENCE_EXPOSURE,
     UNKNOWN,
     VIBRATION,
-    WALLS,
     cause_of,
     largest,
 )
 from lightpage.calibration.goodness.verdict import GOOD, USABLE, Cause, Goodness, Map
-from lightpage.calibration.goodness.walls import relative_height
 from lightpage.calibration.interfaces import Twin
 from lightpage.calibration.waves.wave_model import LaunchConditions, on_modulator
 from lightpage.errors import CalibrationError
@@ -83,8 +81,6 @@ _MOST_RATIO = 1e6
 """Largest ratio in the maps."""
 _FOREIGN = 0.1
 """Least mean square of the symbols' relative errors that shows the light of other symbols."""
-_FITTED_BITS = 0.02
-"""Least information that unequal walls cost, bits a symbol, for their distance to be fitted."""
 _LEAST_BITS = 0.005
 """Least information that a named cause costs, bits a symbol."""
 
@@ -159,7 +155,8 @@ def measure_goodness(
     back = light.waves.back_to_exit
     frame_noise = back(light.frame_noise())
     modulator_noise = back(light.modulator_noise())
-    frame_errors, modulator_errors = page.rough(frame_noise), page.rough(modulator_noise)
+    frame_errors = page.rough(frame_noise)
+    modulator_errors = page.rough(modulator_noise)
     by_neighbours = without_neighbours(page.errors, page.neighbourhood)
     by_level = without_levels(by_neighbours.residual, page.phases)
     errors = by_level.residual
@@ -281,12 +278,6 @@ def _causes(
     foreign = np.mean(np.abs(errors) ** 2) > _FOREIGN
     bits[OTHER_SYMBOLS if foreign else UNKNOWN] = unknown
     details = {DEAD_PIXELS: str(dead), DUST: named_shadows(dark), REFERENCE_EXPOSURE: named_exposures(page.terms)}
-    if bits.get(WALLS, 0.0) >= _FITTED_BITS:
-        width_um = 1e6 * light.waves.channel.geometry.pipe_width_m
-        height, deviation = (width_um * each for each in relative_height(light))
-        details[WALLS] = (
-            f" ({height:+.2f} +- {deviation:.2f} um further apart along y' than the {width_um:.1f} along x)"
-        )
     causes = [cause_of(name, each, details.get(name, "")) for name, each in bits.items() if each >= _LEAST_BITS]
     if lost < GOOD and all(cause.name == UNKNOWN for cause in causes):
         return ()

@@ -22,7 +22,6 @@ _LEAST_ERROR = 0.1
 """Least error of a symbol with a dead pixel, relative to its light."""
 _MOST_DEAD = 0.1
 """Largest share of symbols with dead pixels; more are symbols that were not written."""
-_MAD = 1.4826
 
 
 class Explained(NamedTuple):
@@ -147,7 +146,7 @@ def dead_pixels(errors: Sequence[Complex], noise: float) -> DeadPixels:
         noise: variance of a symbol's phase by noise.
     """
     magnitude = np.min([np.abs(each) for each in errors], axis=0)
-    usual = max(_MAD * float(np.median(np.abs(each.imag))) for each in errors)
+    usual = max(float(scipy.stats.median_abs_deviation(each.imag, axis=None, scale="normal")) for each in errors)
     where = magnitude > max(_OUTLIER * usual, _LEAST_ERROR)
     if len(errors) < 2 or np.mean(where) > _MOST_DEAD:
         where = np.zeros_like(where)

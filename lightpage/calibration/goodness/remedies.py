@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from lightpage.calibration.goodness.camera_faults import CONTRAST
 from lightpage.calibration.goodness.verdict import Cause
 
 
@@ -21,6 +20,9 @@ class Remedy(NamedTuple):
     remedy: str
 
 
+BEND = "bend"
+BLACK_LEVEL = "black level"
+CONTRAST = "contrast"
 LEVELS = "levels"
 NEIGHBOURS = "crosstalk"
 OTHER_SYMBOLS = "other symbols"
@@ -57,13 +59,13 @@ REMEDIES = {
     REFERENCE_EXPOSURE: Remedy(
         "references of another exposure than the pages", "record references with the pages' exposure, each camera's own"
     ),
-    "black level": Remedy(
+    BLACK_LEVEL: Remedy(
         "counts without light: a black level", "subtract the camera's black level, from pages and references"
     ),
     VIBRATION: Remedy(
         "fringes that lost contrast: vibration within an exposure", "shorten the exposure, or still the bench"
     ),
-    "bend": Remedy("cameras that are not linear", "switch off gamma and gain control, or expose less"),
+    BEND: Remedy("cameras that are not linear", "switch off gamma and gain control, or expose less"),
     CAMERA_PIXELS: Remedy("hot or dead pixels of a camera, few places", "cool or replace the camera"),
     DUST: Remedy(
         "dust on a camera that its reference does not show, few places", "clean the camera and record new references"

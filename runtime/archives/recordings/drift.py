@@ -67,7 +67,7 @@ class Drift:
 
 def drift_of(states: Sequence[PageState]) -> dict[str, Drift]:
     """Drift of each quantity that at least two pages show, by the name of its field in `PageState`."""
-    found: dict[str, Drift] = {}
+    drifts: dict[str, Drift] = {}
     for name in PageState._fields:
         values = np.array([getattr(state, name) for state in states], np.float64)
         shown = np.isfinite(values)
@@ -76,12 +76,12 @@ def drift_of(states: Sequence[PageState]) -> dict[str, Drift]:
         if name == "piston_rad":
             values[shown] = np.unwrap(values[shown])
         own = values[shown]
-        found[name] = Drift(
+        drifts[name] = Drift(
             values=tuple(float(value) if np.isfinite(value) else None for value in values),
             step=float(np.sqrt(np.mean(np.diff(own) ** 2))),
             range=float(np.ptp(own)),
         )
-    return found
+    return drifts
 
 
 def described(drifts: dict[str, Drift]) -> str:

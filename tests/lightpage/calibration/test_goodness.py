@@ -14,7 +14,6 @@ from lightpage.calibration.goodness.frame_noise import noise_curve, noise_like, 
 from lightpage.calibration.goodness.light import PageLight
 from lightpage.calibration.goodness.measure import ShownPage, measure_goodness
 from lightpage.calibration.goodness.verdict import Goodness
-from lightpage.calibration.goodness.walls import relative_height
 from lightpage.calibration.parameters import NAMES
 from lightpage.calibration.waves.wave_fit import LevelPrior, WaveFit
 from lightpage.calibration.waves.wave_model import LaunchConditions
@@ -176,16 +175,6 @@ def test_values_of_the_grid_come_to_the_pixels_that_see_them() -> None:
     row, column = np.stack([rows, columns]) + np.tensordot(back, off, 1)
     np.testing.assert_allclose(near[inside], wave(row, column)[inside], atol=0.03)
     assert np.isnan(image[:, -1]).all()
-
-
-@pytest.mark.parametrize("height", [0.001, 0.003])
-def test_walls_of_two_distances_are_measured(height: float) -> None:
-    light = PageLight(TWIN, *fitted_page(f"geometry.pipe_height_relative_error={height}"))
-    light.correct_amplitude()
-    light.correct_counts()
-    value, deviation = relative_height(light)
-    assert value == pytest.approx(height, abs=max(0.1 * height, 3 * deviation))
-    assert deviation < 0.1 * height
 
 
 @pytest.mark.parametrize(
