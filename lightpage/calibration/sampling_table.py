@@ -55,14 +55,23 @@ def symbol_centres(profile: Profile) -> Real:
 
 def registration_coefficients(twin: Twin, parameters: Real, profile: Profile) -> NDArray[np.float32]:
     """Pixels of both cameras as cubics in the grid's coordinates over the page's corner radius, [2, 2, 10]."""
+    return registration_cubics(twin, parameters, profile).astype(np.float32)
+
+
+def registration_cubics(twin: Twin, parameters: Real, profile: Profile) -> Real:
+    """Return the coefficients of `registration_coefficients` in double precision, whose differences are derivatives."""
     grid = field_grid(profile)
     x, y = np.linspace(grid.x_m[0], grid.x_m[-1], _FIT_POINTS), np.linspace(grid.y_m[0], grid.y_m[-1], _FIT_POINTS)
     places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    u, v = places.T / profile.corner_m
-    terms = np.stack([u**i * v**j for i, j in monomial_powers()], axis=-1)
+    terms = cubic_terms(places, profile)
     pixels = twin.pixels(parameters, places)
-    coefficients = [np.linalg.lstsq(terms, camera, rcond=None)[0].T for camera in pixels]
-    return np.stack(coefficients).astype(np.float32)
+    return np.stack([np.linalg.lstsq(terms, camera, rcond=None)[0].T for camera in pixels])
+
+
+def cubic_terms(places: Real, profile: Profile) -> Real:
+    """Terms [N, 10] of a cubic at places (x, y) on the camera plane, metres [N, 2]."""
+    u, v = places.T / profile.corner_m
+    return np.stack([u**i * v**j for i, j in monomial_powers()], axis=-1)
 
 
 def apart_inputs(parameters: Real) -> tuple[str, ...]:

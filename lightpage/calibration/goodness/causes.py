@@ -7,7 +7,7 @@ again. Columns of the fitted parameters are taken off first, since a new fit wou
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 import scipy
@@ -17,6 +17,7 @@ from lightpage.calibration.goodness.equations import coarse_places, equations_of
 from lightpage.calibration.goodness.light import PageLight, places_on_facet, radius2
 from lightpage.calibration.goodness.remedies import CONTRAST, NEIGHBOURS, WALLS
 from lightpage.calibration.parameters import NAMES, PRIORS, indices
+from lightpage.waves.parallel import in_parallel
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
@@ -133,37 +134,52 @@ def _suspects(light: PageLight) -> Iterator[tuple[str, list[Real]]]:
     """Yield each possible cause with the columns by which it would change the equations."""
     coarse = light.coarse
     page = light.page
-    leaving = coarse.to_exit(page)
+    leaving = coarse.to_exit(page)  # lenses and pipe are made before threads ask for them
+    here = coarse.from_exit(leaving)
     across, up = places_on_facet(coarse)
     squares = radius2(coarse)
-    one = np.array([1, 0])[:, None, None]
-
-    def at_exit(factor: Real) -> list[Real]:
-        """A phase over the exit facet, seen by either camera alone."""
-        change = coarse.from_exit(1j * leaving * factor)
-        return [light.equations_of(change * chosen) for chosen in (one, 1 - one)]
-
-    yield "camera focus", at_exit(squares)
-    yield "image moved", [*at_exit(across), *at_exit(up)]
-    yield "lens askew", [*at_exit(across**2 - up**2), *at_exit(across * up)]
-    entering = coarse.from_exit(coarse.to_exit(page, 1j * squares))
-    yield "modulator focus", [light.equations_of(entering)]
     x = light.waves.x[None, :]
     y = light.waves.y[:, None]
-    bent = [light.equations_of(coarse.to_cameras(1j * page * x**i * y**j)) for i, j in _BENDS]
-    yield "modulator bent", bent
-    here = coarse.from_exit(leaving)
-    curved = coarse.from_exit(1j * leaving * squares)
-    tilted = [curved * place * chosen for place in coarse_places(light) for chosen in (one, 1 - one)]
-    yield "camera tilt", [*map(light.equations_of, tilted)]
-    leaned = [coarse.from_exit(coarse.to_exit(np.asarray(page * place), 1j * squares)) for place in (x, y)]
-    yield "modulator tilt", [*map(light.equations_of, leaned)]
-    for name, width in ((WALLS, "pipe_height_relative"), ("taper", "pipe_taper")):
-        changed = [light.changed(None, None, **{width: step}).to_cameras(page) - here for step in _STEPS]
-        yield name, [*map(light.equations_of, changed)]
-    length = light.waves.channel.geometry.pipe_length_m
-    ghost = light.changed(pipe_length_m=3 * length).to_cameras(page)
-    yield "ghost", [light.equations_of(each) for each in (ghost, 1j * ghost)]
-    mixed = [factor * page * step**power for power, factor in ((1, 1j), (2, 1)) for step in light.steps]
-    yield NEIGHBOURS, [light.equations_of(light.waves.to_cameras(each)[:, *light.every]) for each in mixed]
+    one = np.array([1, 0])[:, None, None]
+
+    def at_exit(*factors: Real) -> list[Complex]:
+        """Phases over the exit facet, seen by either camera alone."""
+        changes = [coarse.from_exit(1j * leaving * factor) for factor in factors]
+        return [change * chosen for change in changes for chosen in (one, 1 - one)]
+
+    def at_entrance(*factors: Real) -> list[Complex]:
+        """Phases over the entrance facet that vary over the page."""
+        return [coarse.from_exit(coarse.to_exit(np.asarray(page * factor), 1j * squares)) for factor in factors]
+
+    def tilted() -> list[Complex]:
+        curved = coarse.from_exit(1j * leaving * squares)
+        return [curved * place * chosen for place in coarse_places(light) for chosen in (one, 1 - one)]
+
+    def by_geometry(name: str) -> list[Complex]:
+        return [light.changed(None, None, **{name: step}).to_cameras(page) - here for step in _STEPS]
+
+    def ghost() -> list[Complex]:
+        length = light.waves.channel.geometry.pipe_length_m
+        passed = light.changed(pipe_length_m=3 * length).to_cameras(page)
+        return [passed, 1j * passed]
+
+    def mixed() -> list[Complex]:
+        pages = [factor * page * step**power for power, factor in ((1, 1j), (2, 1)) for step in light.steps]
+        return [light.waves.to_cameras(each)[:, *light.every] for each in pages]
+
+    suspects: dict[str, Callable[[], list[Complex]]] = {
+        "camera focus": lambda: at_exit(squares),
+        "image moved": lambda: at_exit(across, up),
+        "lens askew": lambda: at_exit(across**2 - up**2, across * up),
+        "modulator focus": lambda: at_entrance(np.ones_like(x)),
+        "modulator bent": lambda: [coarse.to_cameras(1j * page * x**i * y**j) for i, j in _BENDS],
+        "camera tilt": tilted,
+        "modulator tilt": lambda: at_entrance(x, y),
+        WALLS: lambda: by_geometry("pipe_height_relative"),
+        "taper": lambda: by_geometry("pipe_taper"),
+        "ghost": ghost,
+        NEIGHBOURS: mixed,
+    }
+    changes = in_parallel(lambda name: [light.equations_of(each) for each in suspects[name]()], [*suspects])
+    yield from zip(suspects, changes, strict=True)
     yield CONTRAST, equations_of_contrast(light)

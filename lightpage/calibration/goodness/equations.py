@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from lightpage.calibration.goodness.frame_noise import CountCurve
 from lightpage.calibration.goodness.light import PageLight, interpolated, rows_and_columns
 from lightpage.calibration.parameters import PARAMETERS, SEEN_BY_CAMERAS, STEPS
+from lightpage.waves.parallel import in_parallel
 
 Real = NDArray[np.float64]
 
@@ -20,17 +21,18 @@ def equations_of_fit(light: PageLight) -> Iterator[Real]:
     leaving = light.coarse.to_exit(light.page)
     fields = light.coarse.from_exit(leaving)
     places = np.stack(np.meshgrid(light.grid.x_m, light.grid.y_m), axis=-1)[light.every]
-    for index in range(min(light.twin.known, len(PARAMETERS))):
+
+    def change_by(index: int) -> Real:
         moved = light.device.parameters.copy()
         moved[index] += STEPS[index]
         if index in SEEN_BY_CAMERAS:
             at = rows_and_columns(light.twin.pixels(moved, places.reshape(-1, 2)).reshape(2, *places.shape))
-            yield light.equations(
-                interpolated(light.images, at) / (2 * light.references[:, *light.every]) - light.counts[:, *light.every]
-            )
-        else:
-            changed = light.coarse.moved(index, light.changed(moved), light.page, leaving, fields)
-            yield light.equations_of(changed - fields)
+            counts = interpolated(light.images, at) / (2 * light.references[:, *light.every])
+            return light.equations(counts - light.counts[:, *light.every])
+        changed = light.coarse.moved(index, light.changed(moved), light.page, leaving, fields)
+        return light.equations_of(changed - fields)
+
+    yield from in_parallel(change_by, range(min(light.twin.known, len(PARAMETERS))))
 
 
 def noise_equations(light: PageLight, modulator_variance_rad2: float) -> Real:

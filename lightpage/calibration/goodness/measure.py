@@ -59,6 +59,7 @@ from lightpage.calibration.interfaces import Twin
 from lightpage.calibration.waves.wave_model import LaunchConditions, on_modulator
 from lightpage.errors import CalibrationError
 from lightpage.recording.frame_pair import FramePair
+from lightpage.waves.parallel import in_parallel
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
@@ -150,7 +151,8 @@ def measure_goodness(
     Raises:
         CalibrationError: the cameras see the light of no symbol.
     """
-    page = _page_errors(twin, pages[0], progress)
+    every = list(in_parallel(lambda page: _page_errors(twin, page, progress), pages))
+    page = every[0]
     light = page.light
     back = light.waves.back_to_exit
     frame_noise = back(light.frame_noise())
@@ -177,7 +179,7 @@ def measure_goodness(
     by_symbols = {LEVELS: by_level, NEIGHBOURS: by_neighbours}
     causes: tuple[Cause, ...] = ()
     if lost >= explained_from or contrast_bits(page.terms) >= explained_from:
-        causes = _causes(twin, pages, page, errors, by_symbols, unexplained, drawn, amount, gains)
+        causes = _causes(every, errors, by_symbols, unexplained, drawn, amount, gains)
     if lost >= GOOD and not causes:
         causes = (cause_of(UNKNOWN, lost),)
     cause = other_profile or (largest(causes) if lost >= GOOD else "")
@@ -223,9 +225,7 @@ def _page_errors(twin: Twin, page: ShownPage, progress: Callable[[float], None] 
 
 
 def _causes(
-    twin: Twin,
-    pages: Sequence[ShownPage],
-    page: _PageErrors,
+    pages: Sequence[_PageErrors],
     errors: Complex,
     by_symbols: dict[str, Explained],
     unexplained: float,
@@ -236,19 +236,17 @@ def _causes(
     """Split what is lost among its causes, the largest first.
 
     Args:
-        twin: ray tracer of the nominal device.
         pages: known pages.
-        page: the first of them, measured.
-        errors: errors of its symbols without those of levels and neighbours.
+        errors: errors of the first one's symbols without those of levels and neighbours.
         by_symbols: what levels and neighbours explain of them, by the name of the cause.
         unexplained: phase variance that a better model would explain.
         drawn: errors as noise alone makes them. An estimator by the fitted waves adds no errors of its own.
         amount: variance of the modulator's phase noise, a sample.
         gains: gains of the cameras' pixels, [2, H, W]; None if unknown.
     """
-    every = [page, *(_page_errors(twin, other) for other in pages[1:])]
-    kept, flicker = without_flicker([each.errors for each in every], [each.phases for each in every])
-    kept = [without_levels(each, one.phases).residual for each, one in zip(kept, every, strict=True)]
+    page = pages[0]
+    kept, flicker = without_flicker([each.errors for each in pages], [each.phases for each in pages])
+    kept = [without_levels(each, one.phases).residual for each, one in zip(kept, pages, strict=True)]
     variance = max(float(np.mean(drawn.imag**2)), _TINY)
     dead = dead_pixels(kept, variance)
     variances = {name: each.variance for name, each in by_symbols.items()}
@@ -259,7 +257,7 @@ def _causes(
     explained[_EDGE:-_EDGE, _EDGE:-_EDGE] = parts
     known = on_modulator(explained, light.waves.samples)
     rest = max(0.0, unexplained - dead.power)
-    dark = np.stack([shadows(*_frames_of(every, camera)) for camera in range(2)])
+    dark = np.stack([shadows(*_frames_of(pages, camera)) for camera in range(2)])
     places = {DUST: equations_near(light, dark)}
     if gains is not None:
         places[CAMERA_PIXELS] = equations_near(light, gains == 0)

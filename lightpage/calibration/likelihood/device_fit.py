@@ -37,7 +37,9 @@ from lightpage.calibration.parameters import NAMES, SEEN_BY_CAMERAS, STEPS
 from lightpage.calibration.sampling_table import (
     SamplingTable,
     cameras_apart,
+    cubic_terms,
     moved_cameras,
+    registration_cubics,
     registration_orientations,
 )
 from lightpage.calibration.waves.wave_fit import inverse_of_information
@@ -240,11 +242,12 @@ class DeviceFit:
             by_unknown = [column[number] for column in columns]
             split = len(of_light)
             by_levels = self._by_levels(fit, number, here, moved_levels)
-            jacobian = np.stack([*by_unknown[:split], *by_cameras, *by_unknown[split:], *by_levels, *by_nuisance])
+            jacobian = [*by_unknown[:split], *by_cameras, *by_unknown[split:], *by_levels, *by_nuisance]
             nuisances = common + NUISANCES * number + np.arange(NUISANCES)
             own = np.append(np.arange(common), nuisances)
-            gradient[own] += fit.gradient(jacobian, here)
-            information[np.ix_(own, own)] += fit.normal_matrix(jacobian, here)
+            page_gradient, page_information = fit.normal_equations(jacobian, here)
+            gradient[own] += page_gradient
+            information[np.ix_(own, own)] += page_information
             gradient[nuisances] -= nuisance_precision() * page.nuisance
             information[nuisances, nuisances] += nuisance_precision()
         prior = registered.prior
@@ -332,13 +335,15 @@ class DeviceFit:
         """
         rows, columns = np.unravel_index(here.places, self._grid.shape)
         points = np.stack([self._grid.x_m[columns], self._grid.y_m[rows]], axis=-1)
-        pixels = self._twin.pixels(parameters, points)
+        terms = cubic_terms(points, self._profile)
+        cubics = registration_cubics(self._twin, parameters, self._profile)
         to_image = registration_orientations(table["registration"])
         derivatives: list[Real] = []
         for index in of_cameras:
             moved = parameters.copy()
             moved[index] += STEPS[index]
-            displacement = (self._twin.pixels(moved, points) - pixels) / STEPS[index]
+            change = registration_cubics(self._twin, moved, self._profile) - cubics
+            displacement = terms @ np.swapaxes(change, 1, 2) / STEPS[index]
             # the inverse of an orientation is its transpose
             derivatives.append(np.einsum("acn,cni,cia->cn", by_shift, displacement, to_image))
         return derivatives

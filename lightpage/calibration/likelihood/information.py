@@ -72,7 +72,7 @@ def measured_information(
             probe = rng.choice([-1.0, 1.0], shape)
             curvature += probe * fit.hessian_product(page, current, probe) / _PROBES / page.power_gain
         couplings += fit.couplings(page, current) / page.power_gain
-        normal += fit.normal_matrix(fit.by_nuisance(page, current), current) / page.power_gain
+        normal += fit.normal_equations([*fit.by_nuisance(page, current)], current)[1] / page.power_gain
     information = _smoothed(curvature / count, seen)
     information = np.maximum(information, _LEAST_INFORMATION * np.median(information))
     couplings = np.stack([scipy.ndimage.median_filter(each, _MEDIAN) for each in couplings[_FITTED] / count])

@@ -19,6 +19,7 @@ from lightpage.calibration.waves.wave_model import LaunchConditions
 from lightpage.errors import CalibrationError
 from lightpage.page.modulation import Modulation
 from lightpage.recording.frame_pair import FramePair
+from lightpage.waves.parallel import in_parallel
 
 Real = NDArray[np.float64]
 
@@ -44,6 +45,8 @@ _GAIN_SAMPLES = 20_000
 """Samples of each camera from which a page's first gain is fitted."""
 _GAIN_STARTS = 8
 """Phases from which that fit may start."""
+_BLOCK = 4096
+"""Samples of each camera whose equations are summed at a time."""
 _LEAST_COUNT = 1e-3
 """Least count of a reference in the weights of that fit."""
 
@@ -183,16 +186,35 @@ class KnownPageFit:
         moved = [self.evaluate(page, nuisance).by_phase for nuisance in _nuisance_steps(page)]
         return np.stack([(current.by_phase - there) / step for there, step in zip(moved, _STEPS, strict=True)])
 
-    def normal_matrix(self, jacobian: Real, current: Derivatives) -> Real:
-        """Fisher information [K, K] of parameters with the Jacobian [K, 2, N] of the expected counts."""
-        information = _count_weights(self.table, current)[:, 2]
-        weighted = (jacobian * information).reshape(len(jacobian), -1)
-        return np.asarray(current.stride * weighted @ jacobian.reshape(len(jacobian), -1).T)
+    def normal_equations(self, jacobian: Sequence[Real], current: Derivatives) -> tuple[Real, Real]:
+        """Gradient and Fisher information of the log-likelihood by some parameters.
 
-    def gradient(self, jacobian: Real, current: Derivatives) -> Real:
-        """Derivative of the log-likelihood by parameters with the Jacobian [K, 2, N] of the expected counts, [K]."""
-        score = _score(self.table, current)
-        return np.asarray(current.stride * jacobian.reshape(len(jacobian), -1) @ score.ravel())
+        Args:
+            jacobian: derivatives of the expected counts by each of K parameters, [2, N] each.
+            current: evaluation of the page.
+
+        Returns:
+            The gradient [K], and the information [K, K].
+        """
+        count = current.places.size
+        parts = [slice(start, start + _BLOCK) for start in range(0, count, _BLOCK)]
+
+        def of_part(part: slice) -> tuple[Real, Real]:
+            """Sums over some samples, whose columns stay in the processor's cache."""
+            expected = current.expected[:, part]
+            weights = _count_weights(self.table, expected)
+            score = current.counts[:, part] * weights[:, 0] - weights[:, 1]
+            columns = np.stack([derivative[:, part] for derivative in jacobian])
+            weighted = (columns * weights[:, 2]).reshape(len(columns), -1)
+            columns = columns.reshape(len(columns), -1)
+            return columns @ score.ravel(), weighted @ columns.T
+
+        gradient = np.zeros(len(jacobian))
+        information = np.zeros((len(jacobian), len(jacobian)))
+        for of_gradient, of_information in in_parallel(of_part, parts):
+            gradient += of_gradient
+            information += of_information
+        return current.stride * gradient, current.stride * information
 
     def deviance(self, statistics: Statistics) -> float:
         """Mean of -2 times the log-likelihood of the pages' counts with given statistics, up to a constant.
@@ -202,8 +224,9 @@ class KnownPageFit:
         tensors = count_tensors(statistics.cameras, 1.0)
         total = 0.0
         for current in self.evaluations:
-            by_score, _, information, score_power = np.moveaxis(_count_weights(tensors, current), 1, 0)
-            score = _score(tensors, current)
+            weights = _count_weights(tensors, current.expected)
+            by_score, offset, information, score_power = np.moveaxis(weights, 1, 0)
+            score = current.counts * by_score - offset
             total += float(np.mean(score**2 / score_power + np.log(information / by_score**2)))
         return total / len(self.pages)
 
@@ -219,10 +242,9 @@ class KnownPageFit:
             The evaluation with the counts that are expected after the step.
         """
         precision = nuisance_precision()
-        normal = self.normal_matrix(jacobian, current) + np.diag(precision)
-        gradient = self.gradient(jacobian, current) - precision * page.nuisance
+        gradient, information = self.normal_equations([*jacobian], current)
         try:
-            step = np.linalg.solve(normal, gradient)
+            step = np.linalg.solve(information + np.diag(precision), gradient - precision * page.nuisance)
         except np.linalg.LinAlgError:
             got = "counts that do not change with the brightness of their page"
             raise CalibrationError("calibration, known pages", got, "the light of known pages") from None
@@ -288,18 +310,12 @@ def nuisance_precision() -> Real:
     return np.array([0, 0, *1 / PRIOR_DEVIATIONS**2])
 
 
-def _count_weights(table: SamplingTable, current: Derivatives) -> Real:
-    """Look up the cameras' tables at the expected counts, [2, 4, N]; see `CountStatistics.weights`."""
-    roots = table["count_scale"][:, None] * np.sqrt(current.expected)
+def _count_weights(table: SamplingTable, expected: Real) -> Real:
+    """Look up the cameras' tables at expected counts [2, N], [2, 4, N]; see `CountStatistics.weights`."""
+    roots = table["count_scale"][:, None] * np.sqrt(expected)
     places = np.minimum((roots + 0.5).astype(np.int64), KNOTS - 1)
     tables = table["count_weights"].astype(np.float64)
     return np.stack([weights[:, place] for weights, place in zip(tables, places, strict=True)])
-
-
-def _score(table: SamplingTable, current: Derivatives) -> Real:
-    """Derivative of the log-likelihood by the expected counts, [2, N]."""
-    weights = _count_weights(table, current)
-    return np.asarray(current.counts * weights[:, 0] - weights[:, 1])
 
 
 def _camera_statistics(evaluations: Sequence[Derivatives]) -> tuple[CountStatistics, CountStatistics]:

@@ -14,6 +14,8 @@ _MEDIAN_CHI2 = 0.4549
 """Median of the square of a normal error, over its variance."""
 _LEAST_VARIANCE = 1e-12
 """Least variance of an error, rad^2: less than float32 can tell."""
+_CONVERGED = 1e-7
+"""Relative change of the log-likelihood at which the noise is fitted: far less than changes the information."""
 _LEAST_SHARE = 1e-12
 """Least share of the variance that either part of the noise may have."""
 
@@ -48,7 +50,10 @@ def fitted_noise(errors: Real, information: Real) -> NDArray[np.float32]:
     least = np.log(variance * _LEAST_SHARE)
     bounds = [(least, 3.0)] * 2
     starts = [np.log(variance * np.array(shares)) for shares in ((0.9, 0.1), (0.1, 0.9))]
-    fits = [scipy.optimize.minimize(loss, start, method="L-BFGS-B", jac=True, bounds=bounds) for start in starts]
+    fits = [
+        scipy.optimize.minimize(loss, start, method="L-BFGS-B", jac=True, bounds=bounds, options={"ftol": _CONVERGED})
+        for start in starts
+    ]
     best = np.exp(min(fits, key=lambda fit: float(fit.fun)).x)
     return np.array([best[0] * np.median(information), best[1]], np.float32)
 

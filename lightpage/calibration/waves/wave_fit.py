@@ -61,9 +61,9 @@ _EXACT = _Sampling(4, 1.0)
 READ_NOISE = 0.3
 """Variance of an equation that does not grow with the light, over the shot noise of the reference alone."""
 ROUNDS = 9
-_STALE = 0.04
+_STALE = 0.2
 """Relative fall of the residual, since the derivative of the light was taken, beyond which it is taken anew. That costs
-as much as several rounds, but one from further off leaves axial places twenty deviations from the best."""
+as much as several rounds; what a smaller fall leaves, the likelihood of all known pages settles."""
 _CONVERGED = 1e-3
 """Relative fall of the residual, found or expected, below which another round does not pay."""
 _LEAST_OFF = 2.0
