@@ -23,6 +23,7 @@ from lightpage.files import replace_file, write_json
 from lightpage.pictures import write_figure_png
 from lightpage.progress import Progress, note, warn
 from lightpage.recording.reader import Recording
+from lightpage.runtime.archives.recordings.drift import described
 from lightpage.runtime.archives.recordings.new_bundle import bundle_by_graphs, calibrating_decoder
 from lightpage.runtime.model.bundle.bundle import Bundle
 from lightpage.runtime.model.decoding.decoder import Decoder
@@ -158,6 +159,8 @@ def calibrate(
     calibration.check_good(f"calibration {out}", f"; {remedy}{without}")
     if found is not None:
         click.echo(calibration.verdict_sentence)
+    if calibration.reading is not None and (drift := described(calibration.reading.drift)):
+        click.echo(f"drift from page to page: {drift}")
     if bundle is not None:
         click.echo(f"{bundle}: version {Bundle.open(bundle).version}, after {time.perf_counter() - start:.0f} s")
 

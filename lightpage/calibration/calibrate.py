@@ -43,6 +43,8 @@ from lightpage.waves.parallel import in_parallel
 Real = NDArray[np.float64]
 SIGNIFICANT = 16.0
 """A patch counts from here: unrelated light reaches it in fewer than one search in a hundred, the widest included."""
+_MOST_PATCHES = 250
+"""Patches, at most, that a stage measures: the bench device, which has 54, is found by them as well."""
 _FEWEST = 5
 """Patches that must be looked for, and measurements that must be found, to fit anything."""
 _CAMERA_GROUPS = ("in_phase", "quadrature", "centre", "camera_phase")
@@ -167,7 +169,6 @@ class _Stage:
     use_phase: bool = False
     half_rate: bool = False
     expected: str = _WANTED
-    most_patches: int | None = None
 
 
 _SINGLE_CAMERA = (
@@ -184,7 +185,7 @@ _PHASES = (_Stage("phases", 2, 1, _ALL_GROUPS, COHERENT_BRANCHES, use_phase=True
 """Each round halves what is left of the error, since patches are measured about the current geometry; two bring it
 within reach of the waves. On a small page they may take a phase for another a turn away: where the light is not
 explained, the waves begin anew without them."""
-_DRIFTED = (_Stage("follow the drift", 6, 2, _ALL_GROUPS, COHERENT_BRANCHES, half_rate=True, most_patches=250),)
+_DRIFTED = (_Stage("follow the drift", 6, 2, _ALL_GROUPS, COHERENT_BRANCHES, half_rate=True),)
 """Stages from an earlier calibration: the complex field is right from the start, so no camera is searched alone."""
 _DRIFT_SHARES = {"angle": 1.0, "lengths": 0.2, "in_phase": 0.3, "quadrature": 0.3, "axial": 0.2}
 _DRIFT_SCALE: Real = np.array([_DRIFT_SHARES.get(parameter.group, 0.05) for parameter in PARAMETERS])
@@ -699,7 +700,7 @@ class _Registration:
 
     def _where(self, stage: _Stage) -> list[Patch]:
         if not stage.middle_only:
-            return self.patches[:: math.ceil(len(self.patches) / (stage.most_patches or len(self.patches)))]
+            return self.patches[:: math.ceil(len(self.patches) / _MOST_PATCHES)]
         return middle_patches(self.profile, self.patches, _FEWEST)
 
     def on_each_camera(self, stage: _Stage) -> list[list[Measurement]]:

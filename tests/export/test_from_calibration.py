@@ -145,6 +145,8 @@ def test_pages_that_the_fit_has_not_seen_judge_it(bundle: Path, small_device: li
     assert reading.air_bits == pytest.approx(read, abs=0.02)
     assert reading.light_bits == pytest.approx(read, abs=0.4)
     assert reading.user_bytes == decoder.page_codec.user_bytes
+    assert reading.drift["piston_rad"] > 0
+    assert reading.drift["image_x_px"] < 0.5
 
 
 def test_one_graph_says_what_the_repeated_step_says(bundle: Path) -> None:

@@ -14,12 +14,15 @@ Complex = NDArray[np.complexfloating]
 
 _NAMED = 3
 """Places that are named."""
-_OUTLIER = 6.0
-"""Deviations from which on a symbol's error is none of noise."""
+_OUTLIER = 4.5
+"""Deviations from which on the root mean square of a symbol's errors on two pages is none of noise: chance has it in
+one symbol of 10^8."""
+_ON_EACH = 0.5
+"""Least error on each page, over the root mean square: a symbol that is wrong on one page alone has no dead pixel."""
 _BLOCK = 5
 """Side, symbols, of the squares over which the variance of errors is compared with that of noise."""
-_LEAST_ERROR = 0.1
-"""Least error of a symbol with a dead pixel, relative to its light."""
+_LEAST_ERROR = 0.03
+"""Least error of a symbol with a dead pixel, relative to its light: half of what one pixel of 16 causes."""
 _MOST_DEAD = 0.1
 """Largest share of symbols with dead pixels; more are symbols that were not written."""
 
@@ -145,9 +148,10 @@ def dead_pixels(errors: Sequence[Complex], noise: float) -> DeadPixels:
         errors: relative errors of each page's symbols, [ny, nx].
         noise: variance of a symbol's phase by noise.
     """
-    magnitude = np.min([np.abs(each) for each in errors], axis=0)
+    magnitudes = np.abs(errors)
+    typical = np.sqrt(np.mean(magnitudes**2, axis=0))
     usual = max(float(scipy.stats.median_abs_deviation(each.imag, axis=None, scale="normal")) for each in errors)
-    where = magnitude > max(_OUTLIER * usual, _LEAST_ERROR)
+    where = (typical > max(_OUTLIER * usual, _LEAST_ERROR)) & (magnitudes.min(axis=0) > _ON_EACH * typical)
     if len(errors) < 2 or np.mean(where) > _MOST_DEAD:
         where = np.zeros_like(where)
     wrong = np.where(where, errors[0].imag ** 2, 0)

@@ -32,6 +32,8 @@ class Reading(TomlTable):
         air_standard_error_bits: its standard error.
         light_bits: information of the light by its Fisher information, bits a symbol.
         user_bytes: user bytes of a page by the chosen code; 0 where no code carries the pages.
+        drift: root mean square of the change from a page to the next, by what changes: a phase in rad, a place in px, a
+            relative stroke or brightness. Empty where fewer than two pages show it, and in documents of before.
     """
 
     in_sample: bool
@@ -40,6 +42,7 @@ class Reading(TomlTable):
     air_standard_error_bits: NonNegative
     light_bits: Annotated[float, Field(gt=0, allow_inf_nan=False)]
     user_bytes: Annotated[int, Field(ge=0)]
+    drift: dict[str, NonNegative] = Field(default_factory=dict)
 
     def __str__(self) -> str:
         """Sentence that states the reading."""

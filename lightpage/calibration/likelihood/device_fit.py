@@ -61,6 +61,9 @@ _ROUNDS = 3
 _LEAST_GAIN = 20.0
 """Expected gain of the log-likelihood by a step, nats an unknown, below which another one does not pay. At 32 electrons
 the first step gains 11 on the bench device, and a second one 0.04."""
+_SCORED_SYMBOLS = 20_000
+"""Symbols from which on no more pages are scored. Two pages of the bench device have 9,744, one full-size page 78,750.
+"""
 _JUDGED = 2
 """Number of known pages that tell causes."""
 _LINEARISED = 0.75
@@ -129,6 +132,7 @@ class DeviceFit:
         self._profile = profile
         self._references = references
         self._pages = pages
+        self._scored = pages[: -(-_SCORED_SYMBOLS // pages[0].symbols.size)]
         self._progress = progress
         self._gains = gains
         self._grid = field_grid(profile)
@@ -207,7 +211,7 @@ class DeviceFit:
         """
         device = self._device(registered)
         table = light_table(self._twin, device, conditions, self._likelihood.apart_inputs(device))
-        fit = KnownPageFit(self._likelihood, table, self._pages, registered.modulation, nuisances)
+        fit = KnownPageFit(self._likelihood, table, self._scored, registered.modulation, nuisances)
         share = 1 - _LINEARISED if rounds else 0.0
         statistics = fit.statistics(conditions, lambda done: self._progress((rounds + share * done) / _ROUNDS))
         fit.table |= count_tensors(statistics.cameras, statistics.correlation)

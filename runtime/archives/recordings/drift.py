@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -84,13 +84,18 @@ def drift_of(states: Sequence[PageState]) -> dict[str, Drift]:
     return drifts
 
 
-def described(drifts: dict[str, Drift]) -> str:
+def steps(drifts: Mapping[str, Drift]) -> dict[str, float]:
+    """Step from page to page of each quantity, by its name."""
+    return {name: drift.step for name, drift in drifts.items()}
+
+
+def described(steps: Mapping[str, float]) -> str:
     """Steps from page to page in words; empty where no drift is known."""
     parts = []
-    for name, drift in drifts.items():
+    for name, step in steps.items():
         what, _, unit = name.rpartition("_")
         shown = "" if unit == "relative" else f" {unit}"
-        parts.append(f"{what.replace('_', ' ')} {drift.step:.2g}{shown}")
+        parts.append(f"{what.replace('_', ' ')} {step:.2g}{shown}")
     return ", ".join(parts)
 
 

@@ -13,6 +13,7 @@ from lightpage.errors import BlackFrameError, InvalidInputError, LostPageError, 
 from lightpage.progress import Progress
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.coded_pages import air_by_symbol
+from lightpage.runtime.archives.recordings.drift import PageState, drift_of, steps
 from lightpage.runtime.archives.recordings.evaluation import decode_unseen, pilots_of
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
@@ -37,9 +38,10 @@ def reading_of(
     """
     mask = pilots_of(decoder, recording)
     rates: list[NDArray[np.float64]] = []
+    states: list[PageState] = []
     in_sample = True
     for in_sample in (False, True):
-        rates = _rates(decoder, recording, mask, progress, in_sample=in_sample)
+        rates, states = _read(decoder, recording, mask, progress, in_sample=in_sample)
         if rates:
             break
     if not rates:
@@ -57,15 +59,22 @@ def reading_of(
         air_standard_error_bits=float(max(by_symbols, by_pages)),
         light_bits=light_bits(information, frames or 0.0, modulator or 0.0),
         user_bytes=0 if code is None else PageCodec(code, mask, decoder.bundle.levels(code.levels)).user_bytes,
+        drift=steps(drift_of(states)),
     )
 
 
-def _rates(
+def _read(
     decoder: Decoder, recording: Recording, mask: NDArray[np.bool_], progress: Progress, *, in_sample: bool
-) -> list[NDArray[np.float64]]:
-    """Contribution of each data symbol to the AIR, bits, of the first pages; a zero for a page that is refused."""
+) -> tuple[list[NDArray[np.float64]], list[PageState]]:
+    """Read the first pages.
+
+    Returns:
+        Contribution of each data symbol to the AIR, bits, of each page; a zero for a page that is refused. State of the
+        device on each page that was read.
+    """
     tracker = tracker_for(decoder)
     rates: list[NDArray[np.float64]] = []
+    states: list[PageState] = []
     for number in range(recording.pages):
         if len(rates) == MOST_READ:
             break
@@ -83,4 +92,5 @@ def _rates(
             continue
         if page is not None:
             rates.append(air_by_symbol(page, symbols, ~mask, decoder.bundle.levels(recording.levels)))
-    return rates
+            states.append(PageState.of(page))
+    return rates, states

@@ -28,7 +28,15 @@ PROFILE = load_profile("bench")
 HASHES = ("0123456789abcdef" * 4, "f" * 64)
 
 
-READ = Reading(in_sample=False, pages=4, air_bits=6.8, air_standard_error_bits=0.02, light_bits=6.9, user_bytes=3800)
+READ = Reading(
+    in_sample=False,
+    pages=4,
+    air_bits=6.8,
+    air_standard_error_bits=0.02,
+    light_bits=6.9,
+    user_bytes=3800,
+    drift={"piston_rad": 0.15, "image_x_px": 0.01},
+)
 
 
 @pytest.fixture
