@@ -7,7 +7,8 @@
     lightpage export RUN --out B.zip
     lightpage evaluate --bundle B.zip --recording R.h5
 
-The truth is printed, as that simulator calls it: lengths are millimetres.
+`lightpage calibrate --recording R.h5 --out C.toml --export B.zip` makes a bundle without training. The truth is printed,
+as that simulator calls it: lengths are millimetres.
 """
 
 from __future__ import annotations
@@ -53,39 +54,56 @@ USUAL = Parameters(
     shift_drift_px=0.05,
 )
 """A device whose numbers are off as on a bench, without a fault of its modulator or its planes."""
-SHARES = {"usual": 0.0, "third": 1 / 3, "all": 1.0}
-"""How much of `faulty` each device has."""
 DRAWN_SHARE = 0.7
 
 
 def faulty(device: Parameters, share: float) -> Parameters:
     """Return a device with a share of uneven levels, unmodulated light, planes out of focus, keystone, nonlinearity."""
 
-    def camera(of: Camera, axial_rad: float, sign: int) -> Camera:
-        keystone = (sign * 0.0015 * share, sign * 0.001 * share)
-        return replace(of, behind_mm=axial_rad * MM_PER_RAD * share, keystone=keystone)
+    def camera(of: Camera, sign: int) -> Camera:
+        return replace(of, keystone=(sign * 0.0015 * share, sign * 0.001 * share))
 
+    device = out_of_focus(device, share)
     return replace(
         device,
         stroke_error=-0.015 * share,
         level_sine_rad=0.15 * share,
         unmodulated=0.1 * share,
-        modulator_behind_mm=1.2 * MM_PER_RAD * share,
         nonlinearity=0.03 * share,
-        in_phase_camera=camera(device.in_phase_camera, 0.8, 1),
-        quadrature_camera=camera(device.quadrature_camera, -0.7, -1),
+        in_phase_camera=camera(device.in_phase_camera, 1),
+        quadrature_camera=camera(device.quadrature_camera, -1),
     )
 
 
+def out_of_focus(device: Parameters, share: float) -> Parameters:
+    """Return a device with a share of 1.2 rad at the modulator, 0.8 and -0.7 rad at the cameras."""
+    mm = MM_PER_RAD * share
+    return replace(
+        device,
+        modulator_behind_mm=1.2 * mm,
+        in_phase_camera=replace(device.in_phase_camera, behind_mm=0.8 * mm),
+        quadrature_camera=replace(device.quadrature_camera, behind_mm=-0.7 * mm),
+    )
+
+
+DEVICES = {
+    "usual": USUAL,
+    "planes": out_of_focus(USUAL, 1.0),
+    "third": faulty(USUAL, 1 / 3),
+    "all": faulty(USUAL, 1.0),
+}
+"""Devices by name: without a fault, with planes out of focus alone, with a third of all faults, and with all."""
+
+
 @click.command()
-@click.option("--device", "name", type=click.Choice(list(SHARES)), default="third", show_default=True)
+@click.option("--device", "name", type=click.Choice(list(DEVICES)), default="third", show_default=True)
 @click.option("--drawn", type=click.IntRange(0), help="A device of the whole capture range, drawn by this seed.")
 @click.option("--pages", default=30, show_default=True, type=click.IntRange(1))
 @click.option("--seed", default=5, show_default=True, type=click.IntRange(0), help="Seed of symbols, noise and drift.")
 @click.option("--out", type=OutputFile(), required=True, help="Recording, overwritten.")
 def main(name: str, drawn: int | None, pages: int, seed: int, out: Path) -> None:
     """Record pages of an imperfect device, and print the truth."""
-    device = faulty(USUAL, SHARES[name])
+    device = DEVICES[name]
     if drawn is not None:
         device = faulty(draw_parameters(np.random.default_rng([drawn, 1])), DRAWN_SHARE)
     ForeignDevice(device).write(out, pages, LEVELS, seed)
