@@ -7,8 +7,8 @@
     lightpage export RUN --out B.zip
     lightpage evaluate --bundle B.zip --recording R.h5
 
-`lightpage calibrate --recording R.h5 --out C.toml --export B.zip` makes a bundle without training. The truth is printed,
-as that simulator calls it: lengths are millimetres.
+`lightpage calibrate --recording R.h5 --out C.toml --export B.zip` makes a bundle without training. The truth is
+printed, as that simulator calls it: lengths are millimetres.
 """
 
 from __future__ import annotations
