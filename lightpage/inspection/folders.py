@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Collection
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
+from lightpage.calibration.sampling_table import APART
 from lightpage.device.profile import Profile, parse_profile
 from lightpage.errors import InvalidInputError
 from lightpage.failures import os_errors
@@ -76,10 +78,14 @@ def look_at_bundle(path: Path) -> Finding:
                 {"rows": rows, "columns": columns, "type": manifest.frame_dtype},
                 f"{rows} x {columns}, {manifest.frame_dtype}",
             ),
+            "decoder": "fitted waves" if bundle.is_estimator else "network",
+            "planes": planes_of(manifest.table_inputs),
             "code": "none" if bundle.code is None else bundle.code.describe(),
             "files": Fact(sorted(manifest.files), ", ".join(sorted(manifest.files))),
             **{name.replace("_", " "): value for name, value in list(manifest.metrics.items())[:_TOLD]},
         }
+        if bundle.is_estimator:
+            found.facts["calibration"] = bundle.calibration.verdict_sentence or "not judged"
         golden = bundle.golden
         found.pictures = lambda: [
             ("golden page, in-phase", golden.pair.in_phase, "counts"),
@@ -90,6 +96,17 @@ def look_at_bundle(path: Path) -> Finding:
         f"lightpage serve --bundle {found.quoted} --source recording:R.h5 --address 127.0.0.1:50051",
     ]
     return found
+
+
+def planes_of(inputs: Collection[str]) -> str:
+    """Say which planes of the cameras the graphs of a bundle allow for, by the inputs of their table.
+
+    A recalibration fits places and tilts within these, and adds none.
+    """
+    common, _, tilted = (name in inputs for name in APART)
+    if tilted:
+        return "each camera its own, tilted against the other's"
+    return "each camera its own" if common else "one for both cameras"
 
 
 def _run(path: Path, finished: bool) -> Finding:

@@ -14,6 +14,7 @@ import tifffile
 from PIL import Image
 from scipy.io import savemat
 
+from lightpage.calibration.sampling_table import APART
 from lightpage.cli import main
 from lightpage.errors import InvalidInputError, LightpageError, StorageError, SurroundingsError, WorkerError
 from lightpage.helper_process import Helper, HelperProcess
@@ -21,8 +22,10 @@ from lightpage.inspection import apart
 from lightpage.inspection.apart import look_apart
 from lightpage.inspection.command import inspect, table
 from lightpage.inspection.documents import SERVICE_TABLES
+from lightpage.inspection.folders import planes_of
 from lightpage.inspection.look import look
 from lightpage.recording.decoded_file import DecodedWriter
+from lightpage.runtime.model.bundle.shipped import bundle_path
 from lightpage.runtime.service.settings import ServiceSettings
 from tests.lightpage.refused import refused
 from tests.lightpage.small import small_profile
@@ -200,3 +203,23 @@ def test_a_recording_is_looked_at_and_drawn(small_device: list[str], tmp_path: P
     assert "page 1" in same
     assert "bench" in fit
     assert "page 0" in black
+
+
+def test_a_bundle_states_what_its_graphs_compute_and_how_it_was_judged(tmp_path: Path) -> None:
+    told = tmp_path / "J"
+    assert main.run(inspect, [str(bundle_path("bench")), "--json", str(told)]) == 0
+    facts = json.loads(told.read_text())["facts"]
+    assert (facts["decoder"], facts["planes"]) == ("fitted waves", "one for both cameras")
+    assert facts["calibration"].startswith("a good fit")
+
+
+@pytest.mark.parametrize(
+    ("inputs", "planes"),
+    [
+        ((), "one for both cameras"),
+        (APART[:1], "each camera its own"),
+        (APART, "each camera its own, tilted against the other's"),
+    ],
+)
+def test_planes_are_those_whose_tensors_a_table_has(inputs: tuple[str, ...], planes: str) -> None:
+    assert planes_of(["parameters", *inputs]) == planes
