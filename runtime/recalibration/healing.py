@@ -48,11 +48,15 @@ from lightpage.runtime.recalibration.unknown_pages import UnknownPages
 TOGETHER = 6
 """Pages at most that one healing takes: the pilots of six show a smooth error as well as it can be shown."""
 
-MOST_ROUNDS = 5
-"""The bench device comes right in one to three, as long as the pipe's angle is off by no more than 0.3 degree."""
+MOST_ROUNDS = 8
+"""Largest number of rounds. The bench device takes one to three where one thing has changed, and six where angle,
+focus, stroke and both cameras have."""
 
 _IN_VAIN = 2
-"""Times that a page claims enough and no checksum holds, after which no more is won: its bits are those of no page."""
+"""Rounds that bring the pages no nearer to being read, after which healing ends: their bits are those of no page."""
+
+_LEAST_PROGRESS = 0.02
+"""Least relative fall of what all pages lack by which a round brings them nearer."""
 
 _AROUND_PX = np.array([(x, y) for x in (-20.0, 0.0, 20.0) for y in (-20.0, 0.0, 20.0)])
 """Where the image is looked for, beside where it was last seen: it is found within some thirty pixels."""
@@ -124,9 +128,14 @@ def heal(
     start = time.perf_counter()
     with raised_as(RecalibrationRefusedError, CalibrationError, FrameError, InvalidInputError, PageError):
         work = _Healing(decoder, pages, OnnxTwin(decoder.bundle) if twin is None else twin)
-        model, rounds, in_vain = work.model, 0, 0
+        model = work.model
+        rounds = 0
+        in_vain = 0
+        least = np.inf
         while (known := work.known(model)) is None:
-            in_vain += not work.lacking(model)
+            lacking = work.lacking_of_all(model)
+            in_vain += not lacking < (1 - _LEAST_PROGRESS) * least
+            least = min(least, lacking)
             if rounds == MOST_ROUNDS or in_vain == _IN_VAIN:
                 got = f"{len(work.pairs)} pages of which none is read after round {rounds}; {work.unread(model)}"
                 raise RecalibrationRefusedError("healing", got, _WANTED)
@@ -241,6 +250,10 @@ class _Healing:
     def lacking(self, model: _Model) -> float:
         """Return what the page that is nearest to being read lacks by its own claims, bits a symbol to two digits."""
         return round(max(0.0, min(-page.margin_bits for page in self._read(model))), 2)
+
+    def lacking_of_all(self, model: _Model) -> float:
+        """Return what all pages together lack by their own claims, bits a symbol."""
+        return sum(max(0.0, -page.margin_bits) for page in self._read(model))
 
     def unread(self, model: _Model) -> str:
         """Return how far the page that is nearest is from being read."""

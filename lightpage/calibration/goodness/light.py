@@ -59,6 +59,7 @@ class PageLight:
         at: rows and columns of both cameras' pixels at the places of the grid.
         images: filtered differences of frames and references, [H, W] each.
         pair: frames of the page.
+        symbols: unit phasors of the page's symbols, [ny, nx].
     """
 
     def __init__(
@@ -73,6 +74,7 @@ class PageLight:
         self.twin = twin
         self.device = device
         self.pair = pair
+        self.symbols = symbols
         self._samples = symbol_samples(profile)
         self.grid = field_grid(profile)
         self.stride = max(_LEAST_STRIDE, int(np.sqrt(np.prod(self.grid.shape) / _EQUATIONS)))

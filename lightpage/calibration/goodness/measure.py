@@ -51,10 +51,12 @@ from lightpage.calibration.goodness.remedies import (
     REFERENCE_EXPOSURE,
     UNKNOWN,
     VIBRATION,
+    WALLS,
     cause_of,
     largest,
 )
 from lightpage.calibration.goodness.verdict import GOOD, USABLE, Cause, Goodness, Map
+from lightpage.calibration.goodness.walls import wall_difference
 from lightpage.calibration.interfaces import Twin
 from lightpage.calibration.waves.wave_model import LaunchConditions, on_modulator
 from lightpage.errors import CalibrationError
@@ -82,6 +84,8 @@ _MOST_RATIO = 1e6
 """Largest ratio in the maps."""
 _FOREIGN = 0.1
 """Least mean square of the symbols' relative errors that shows the light of other symbols."""
+_LEAST_MEASURED = 0.03
+"""Least information that unequal walls cost by their estimate, bits a symbol, for their difference to be measured."""
 _LEAST_BITS = 0.005
 """Least information that a named cause costs, bits a symbol."""
 
@@ -137,6 +141,7 @@ def measure_goodness(
     *,
     gains: NDArray[np.uint8] | None = None,
     explained_from: float = GOOD,
+    values: bool = False,
 ) -> Goodness:
     """Measure how well a fitted device explains the light of a known page, and what causes the rest.
 
@@ -147,6 +152,7 @@ def measure_goodness(
         progress: called with the finished share of the work.
         gains: gains of the cameras' pixels, which are 0 where they have no signal, [2, H, W]; None if unknown.
         explained_from: loss, bits a symbol, from which on its causes are searched.
+        values: whether the sizes of causes are measured too, as far as that is known. It takes longer than the fit.
 
     Raises:
         CalibrationError: the cameras see the light of no symbol.
@@ -179,7 +185,7 @@ def measure_goodness(
     by_symbols = {LEVELS: by_level, NEIGHBOURS: by_neighbours}
     causes: tuple[Cause, ...] = ()
     if lost >= explained_from or contrast_bits(page.terms) >= explained_from:
-        causes = _causes(every, errors, by_symbols, unexplained, drawn, amount, gains)
+        causes = _causes(every, errors, by_symbols, unexplained, drawn, amount, gains, values=values)
     if lost >= GOOD and not causes:
         causes = (cause_of(UNKNOWN, lost),)
     cause = other_profile or (largest(causes) if lost >= GOOD else "")
@@ -232,6 +238,8 @@ def _causes(
     drawn: Complex,
     amount: float,
     gains: NDArray[np.uint8] | None,
+    *,
+    values: bool,
 ) -> tuple[Cause, ...]:
     """Split what is lost among its causes, the largest first.
 
@@ -243,6 +251,7 @@ def _causes(
         drawn: errors as noise alone makes them. An estimator by the fitted waves adds no errors of its own.
         amount: variance of the modulator's phase noise, a sample.
         gains: gains of the cameras' pixels, [2, H, W]; None if unknown.
+        values: whether the sizes of causes are measured too.
     """
     page = pages[0]
     kept, flicker = without_flicker([each.errors for each in pages], [each.phases for each in pages])
@@ -276,6 +285,8 @@ def _causes(
     foreign = np.mean(np.abs(errors) ** 2) > _FOREIGN
     bits[OTHER_SYMBOLS if foreign else UNKNOWN] = unknown
     details = {DEAD_PIXELS: str(dead), DUST: named_shadows(dark), REFERENCE_EXPOSURE: named_exposures(page.terms)}
+    if values and bits.get(WALLS, 0.0) >= _LEAST_MEASURED:
+        details[WALLS] = str(wall_difference(light) or "")
     causes = [cause_of(name, each, details.get(name, "")) for name, each in bits.items() if each >= _LEAST_BITS]
     if lost < GOOD and all(cause.name == UNKNOWN for cause in causes):
         return ()

@@ -187,7 +187,7 @@ class DeviceFit:
             moved = replace(registered, parameters=_at_page(registered.parameters, page.nuisance))
             launched = conditions._replace(illumination=illumination * (page.gain * phase))
             shown.append(ShownPage(self._device(moved), launched, known.pair, known.symbols))
-        return measure_goodness(self._twin, shown, gains=self._gains, explained_from=0.0)
+        return measure_goodness(self._twin, shown, gains=self._gains, explained_from=0.0, values=True)
 
     def _device(self, registered: Registered) -> CalibratedDevice:
         return CalibratedDevice(

@@ -7,7 +7,7 @@ the arms is, and what pipe and lenses are: more than patches of symbols do, sinc
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal, NamedTuple
@@ -176,11 +176,19 @@ class WaveFit:
         profile: the nominal device.
         pair, references: frames of a known page, and reference-only frames.
         symbols: unit phasors of the page's symbols, complex [ny, nx].
+        changed: fields of the geometry that are not as fitted, see `FittedWaves`.
     """
 
     def __init__(
-        self, twin: Twin, profile: Profile, pair: FramePair, references: FramePair, symbols: NDArray[np.complex128]
+        self,
+        twin: Twin,
+        profile: Profile,
+        pair: FramePair,
+        references: FramePair,
+        symbols: NDArray[np.complex128],
+        changed: Mapping[str, float] | None = None,
     ) -> None:
+        self._changed = changed
         self._twin, self._profile, self._symbols = twin, profile, symbols.size
         self._samples = symbol_samples(profile)
         self._phases = np.mod(np.angle(symbols), 2 * np.pi)
@@ -315,7 +323,13 @@ class WaveFit:
         self, parameters: Real, blur: float, sampling: _Sampling, stride: int = 1, like: FittedWaves | None = None
     ) -> FittedWaves:
         """Return the waves on every so many samples of the common grid; `like` as for `FittedWaves`."""
-        how: dict[str, Any] = {"stride": stride, "accuracy": sampling.accuracy, "like": like, "blur": blur}
+        how: dict[str, Any] = {
+            "stride": stride,
+            "accuracy": sampling.accuracy,
+            "like": like,
+            "blur": blur,
+            "changed": self._changed,
+        }
         samples = min(sampling.samples, self._samples)
         return FittedWaves(self._profile, parameters, samples, filled=True, **how)
 
