@@ -14,6 +14,7 @@ from lightpage.calibration.goodness.frame_noise import noise_curve, noise_like, 
 from lightpage.calibration.goodness.light import PageLight
 from lightpage.calibration.goodness.measure import ShownPage, measure_goodness
 from lightpage.calibration.goodness.verdict import Goodness
+from lightpage.calibration.goodness.walls import WallDifference, wall_difference
 from lightpage.calibration.parameters import NAMES
 from lightpage.calibration.waves.wave_fit import LevelPrior, WaveFit
 from lightpage.calibration.waves.wave_model import LaunchConditions
@@ -212,3 +213,17 @@ def test_vibration_costs_the_contrast_and_what_the_model_lacks_by_it() -> None:
 
 def test_a_good_fit_has_no_causes() -> None:
     assert measure_goodness(TWIN, [ShownPage(*fitted_page())], explained_from=0.0).causes == ()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("difference", [0.0, -0.002])
+def test_the_difference_of_height_and_width_is_right_within_its_deviations(difference: float) -> None:
+    known, conditions, pair, symbols = fitted_page(f"geometry.pipe_height_relative_error={difference}")
+    measured = wall_difference(PageLight(TWIN, known, conditions, pair, symbols))
+    assert measured is not None
+    assert measured.relative == pytest.approx(difference, abs=max(5 * measured.deviation, 0.1 * abs(difference)))
+    assert measured.deviation < 2e-4
+
+
+def test_the_difference_of_height_and_width_is_stated_in_micrometres() -> None:
+    assert str(WallDifference(-0.001, 2e-5, 0.89e-3)) == " (height minus width: -0.890 +- 0.018 um)"
