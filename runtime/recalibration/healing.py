@@ -134,7 +134,7 @@ def heal(
         least = np.inf
         while (known := work.known(model)) is None:
             lacking = work.lacking_of_all(model)
-            in_vain += not lacking < (1 - _LEAST_PROGRESS) * least
+            in_vain += lacking == 0 or lacking >= (1 - _LEAST_PROGRESS) * least
             least = min(least, lacking)
             if rounds == MOST_ROUNDS or in_vain == _IN_VAIN:
                 got = f"{len(work.pairs)} pages of which none is read after round {rounds}; {work.unread(model)}"
