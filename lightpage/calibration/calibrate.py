@@ -16,7 +16,7 @@ from lightpage.calibration.goodness.measure import ShownPage, measure_goodness
 from lightpage.calibration.goodness.remedies import LEVELS, NEIGHBOURS
 from lightpage.calibration.goodness.verdict import USABLE, Goodness
 from lightpage.calibration.interfaces import FieldSolver, RememberingTwin, Twin
-from lightpage.calibration.parameters import NAMES, PARAMETERS, PRIORS, Prior, indices, nominal
+from lightpage.calibration.parameters import GROUPS, NAMES, PARAMETERS, PRIORS, Prior, indices, nominal
 from lightpage.calibration.patch_fit import PatchFit, fit_parameters
 from lightpage.calibration.patches import (
     Measurement,
@@ -49,7 +49,6 @@ _FEWEST = 5
 """Patches that must be looked for, and measurements that must be found, to fit anything."""
 _CAMERA_GROUPS = ("in_phase", "quadrature", "centre", "camera_phase")
 _SHAPE_GROUPS = (*_CAMERA_GROUPS, "lengths", "distortion", "keystone", "launch")
-_ALL_GROUPS = tuple(dict.fromkeys(p.group for p in PARAMETERS))
 _LEAST_OVER_CHANCE = 8.0
 """Coherence that a calibration must reach, in units of 1/sqrt(symbols of a page), what chance gives. Measured on the
 bench device: 34 or more where it was found, 18 with half of the symbols wrong; at most 2.3 for the right symbols at
@@ -177,15 +176,15 @@ _SINGLE_CAMERA = (
     _Stage("settle the cameras", 6, 2, _SHAPE_GROUPS),
 )
 _COMPLEX = (
-    _Stage("find the reflections", 32, 4, _ALL_GROUPS, _REFLECTED, half_rate=True, expected=_WANTED_REFLECTIONS),
-    _Stage("all branches, coarse", 8, 2, _ALL_GROUPS, COHERENT_BRANCHES),
-    _Stage("all branches, fine", 3, 1, _ALL_GROUPS, COHERENT_BRANCHES),
+    _Stage("find the reflections", 32, 4, GROUPS, _REFLECTED, half_rate=True, expected=_WANTED_REFLECTIONS),
+    _Stage("all branches, coarse", 8, 2, GROUPS, COHERENT_BRANCHES),
+    _Stage("all branches, fine", 3, 1, GROUPS, COHERENT_BRANCHES),
 )
-_PHASES = (_Stage("phases", 2, 1, _ALL_GROUPS, COHERENT_BRANCHES, use_phase=True),) * 2
+_PHASES = (_Stage("phases", 2, 1, GROUPS, COHERENT_BRANCHES, use_phase=True),) * 2
 """Each round halves what is left of the error, since patches are measured about the current geometry; two bring it
 within reach of the waves. On a small page they may take a phase for another a turn away: where the light is not
 explained, the waves begin anew without them."""
-_DRIFTED = (_Stage("follow the drift", 6, 2, _ALL_GROUPS, COHERENT_BRANCHES, half_rate=True),)
+_DRIFTED = (_Stage("follow the drift", 6, 2, GROUPS, COHERENT_BRANCHES, half_rate=True),)
 """Stages from an earlier calibration: the complex field is right from the start, so no camera is searched alone."""
 _DRIFT_SHARES = {"angle": 1.0, "lengths": 0.2, "in_phase": 0.3, "quadrature": 0.3, "axial": 0.2}
 _DRIFT_SCALE: Real = np.array([_DRIFT_SHARES.get(parameter.group, 0.05) for parameter in PARAMETERS])
@@ -259,7 +258,7 @@ def _best_of_starts(work: _Registration) -> Registered:
             start = _state(work)
             if axis is not None:
                 _relate_apart(work, axis)
-            work.waves(what, _ALL_GROUPS)
+            work.waves(what, GROUPS)
             outcome = work.result()
             found.append((_bits_lost(outcome), outcome, start))
         except CalibrationError as error:
@@ -346,7 +345,7 @@ def refine(
         work.modulation = near.modulation
     work.judged = judged and not rough
     work.total = len(_DRIFTED) + (3 if work.judged else 2)
-    known = tuple(group for group in _ALL_GROUPS if max(indices(group)) < twin.known)
+    known = tuple(group for group in GROUPS if max(indices(group)) < twin.known)
     for stage in _DRIFTED:
         work.complex_field(replace(stage, groups=known), _DRIFT_SCALE)
     work.waves("waves", known, _DRIFT_SCALE)

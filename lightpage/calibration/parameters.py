@@ -80,6 +80,8 @@ PARAMETERS: tuple[Parameter, ...] = (
     *(Parameter(f"cameras_apart_{axis}_rad", 0.2, "tilt_apart") for axis in "xy"),
 )
 
+GROUPS: tuple[str, ...] = tuple(dict.fromkeys(p.group for p in PARAMETERS))
+"""Groups of all parameters."""
 NAMES: tuple[str, ...] = tuple(p.name for p in PARAMETERS)
 _FIRST_UNKNOWN = ("modulator_axial_rad", "modulator_axial_x_rad", "cameras_apart_x_rad")
 KNOWN = (*map(NAMES.index, _FIRST_UNKNOWN), len(NAMES))

@@ -13,10 +13,9 @@ import numpy as np
 import scipy
 
 from lightpage.calibration.goodness.light import PageLight
-from lightpage.calibration.parameters import PARAMETERS
+from lightpage.calibration.parameters import GROUPS
 from lightpage.calibration.waves.wave_fit import WaveFit
 
-_GROUPS = tuple(dict.fromkeys(parameter.group for parameter in PARAMETERS))
 _FIRST_STEP = 5e-4
 """First change of the height over the width that is tried."""
 _MOST_STEPS = 6
@@ -40,8 +39,8 @@ class WallDifference(NamedTuple):
 
     def __str__(self) -> str:
         """Difference of height and width in words."""
-        value, deviation = 1e6 * self.width_m * self.relative, 1e6 * self.width_m * self.deviation
-        return f" (height minus width: {value:+.3f} +- {deviation:.3f} um)"
+        width_um = 1e6 * self.width_m
+        return f" (height minus width: {width_um * self.relative:+.3f} +- {width_um * self.deviation:.3f} um)"
 
 
 def wall_difference(light: PageLight) -> WallDifference | None:
@@ -58,7 +57,7 @@ def wall_difference(light: PageLight) -> WallDifference | None:
         nonlocal best
         changed = {"pipe_height_relative": difference}
         fit = WaveFit(light.twin, device.profile, light.pair, device.references, light.symbols, changed)
-        fitted = fit.fit(*best, _GROUPS, modulation=device.modulation, effort="once")
+        fitted = fit.fit(*best, GROUPS, modulation=device.modulation, effort="once")
         if not squares or fitted.residual**2 < min(squares.values()):
             best = fitted.parameters, fitted.quadrature_phase
         squares[difference] = fitted.residual**2

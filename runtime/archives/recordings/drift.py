@@ -84,7 +84,7 @@ def drift_of(states: Sequence[PageState]) -> dict[str, Drift]:
     return drifts
 
 
-def steps(drifts: Mapping[str, Drift]) -> dict[str, float]:
+def steps_of(drifts: Mapping[str, Drift]) -> dict[str, float]:
     """Step from page to page of each quantity, by its name."""
     return {name: drift.step for name, drift in drifts.items()}
 

@@ -13,7 +13,7 @@ from lightpage.errors import BlackFrameError, InvalidInputError, LostPageError, 
 from lightpage.progress import Progress
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.coded_pages import air_by_symbol
-from lightpage.runtime.archives.recordings.drift import PageState, drift_of, steps
+from lightpage.runtime.archives.recordings.drift import PageState, drift_of, steps_of
 from lightpage.runtime.archives.recordings.evaluation import decode_unseen, pilots_of
 from lightpage.runtime.model.decoding.decoder import Decoder
 from lightpage.runtime.model.decoding.image_tracker import tracker_for
@@ -59,7 +59,7 @@ def reading_of(
         air_standard_error_bits=float(max(by_symbols, by_pages)),
         light_bits=light_bits(information, frames or 0.0, modulator or 0.0),
         user_bytes=0 if code is None else PageCodec(code, mask, decoder.bundle.levels(code.levels)).user_bytes,
-        drift=steps(drift_of(states)),
+        drift=steps_of(drift_of(states)),
     )
 
 

@@ -8,7 +8,7 @@ from lightpage.cli.options import JSON
 from lightpage.metrics.provenance import write_figures
 from lightpage.progress import warn
 from lightpage.recording.reader import Recording
-from lightpage.runtime.archives.recordings.drift import described, pages_until, steps
+from lightpage.runtime.archives.recordings.drift import described, pages_until, steps_of
 from lightpage.runtime.archives.recordings.evaluation import Evaluation, NothingReadError
 from lightpage.runtime.archives.recordings.evaluation import evaluate as evaluate_recording
 from lightpage.runtime.archives.recordings.refused import WORTH_NOTHING, refusal, unconfirmed
@@ -71,7 +71,7 @@ def describe(result: Evaluation) -> str:
         ("page", f"{result.page_kb:.3f} kB"),
         ("symbol error rate", f"{figures.symbol_error_rate:.4f}{MANY if figures.levels >= _MANY_LEVELS else ''}"),
         ("ECE", f"{figures.ece:.4f}"),
-        ("drift from page to page", described(steps(result.drift)) or "not shown"),
+        ("drift from page to page", described(steps_of(result.drift)) or "not shown"),
         (
             "image moves by 1 px",
             "not in sight" if to_pixel is None else f"in some {to_pixel:,} pages, as a random walk",

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lightpage.calibration.parameters import NAMES, PARAMETERS, PRIORS, indices
+from lightpage.calibration.parameters import GROUPS, NAMES, PRIORS, indices
 from lightpage.calibration.waves import wave_fit
 from lightpage.calibration.waves.wave_fit import LevelPrior, WaveFit
 from lightpage.device.profile import Profile
@@ -31,7 +31,6 @@ from tests.lightpage.small import THICK, small_profile
 PROFILE = small_profile()
 TWIN = TorchTwin(RayTwin(PROFILE))
 TURN = np.deg2rad(-90 + 3)
-EVERY = tuple(dict.fromkeys(parameter.group for parameter in PARAMETERS))
 
 
 def seen_by(device: Device, seed: int, profile: Profile = PROFILE, *, turned: bool = False) -> WaveFit:
@@ -91,8 +90,8 @@ def test_a_realistic_device_is_told_from_near_it_with_calibrated_deviations() ->
     start = truth + 0.02 * PRIORS * rng.standard_normal(len(PRIORS))
     start[angle] = truth[angle] + 4e-4
     fit = seen_by(device, seed)
-    found = fit.fit(start, device.homodyne.turn_rad, EVERY, modulation=levels)
-    again = fit.fit(found.parameters, found.quadrature_phase, EVERY, modulation=levels).parameters
+    found = fit.fit(start, device.homodyne.turn_rad, GROUPS, modulation=levels)
+    again = fit.fit(found.parameters, found.quadrature_phase, GROUPS, modulation=levels).parameters
     assert np.mean(((again - found.parameters) / np.maximum(found.deviations, 1e-30)) ** 2) < 0.25**2
     assert abs(found.parameters[angle] - truth[angle]) < 3 * found.deviations[angle] < 3e-4
     off_rad = abs(found.quadrature_phase - device.homodyne.turn_rad)
@@ -119,7 +118,7 @@ def test_how_much_path_real_lenses_add_comes_back() -> None:
     truth = true_parameters(thick, device)
     start = truth.copy()
     start[index] = 0
-    found = seen_by(device, 4, thick).fit(start, device.homodyne.turn_rad, EVERY)
+    found = seen_by(device, 4, thick).fit(start, device.homodyne.turn_rad, GROUPS)
     assert 0 < found.deviations[index] < 0.02
     assert found.parameters[index] == pytest.approx(0.1, abs=3 * found.deviations[index])
 
@@ -145,7 +144,7 @@ def test_a_nominal_modulator_stays_nominal_and_axial_places_and_tilts_are_found_
     truth = true_parameters(PROFILE, device)
     start, axial = truth.copy(), indices("axial", "tilt", "tilt_apart")
     start[axial] += [0.4, -0.2, 0.1, 0.2, -0.4, -0.3, 0.05, 0.2, -0.1]
-    found = seen_by(device, 5).fit(start, device.homodyne.turn_rad, EVERY, levels=LevelPrior())
+    found = seen_by(device, 5).fit(start, device.homodyne.turn_rad, GROUPS, levels=LevelPrior())
     assert found.modulation is NOMINAL
     assert all(found.modulation_deviations)
     even = found.conditions.illumination[0]
@@ -160,7 +159,7 @@ def test_what_the_modulator_makes_of_its_levels_comes_back_with_calibrated_devia
     slm = slm.model_copy(update={"blur_px": 0.45, "crosstalk_relative": 0.02})
     device = Device(slm=slm, drift=Drift(shift_px=0))
     start, truth = true_parameters(PROFILE, device), true_modulation(slm, PROFILE)
-    found = seen_by(device, 2).fit(start, device.homodyne.turn_rad, EVERY, levels=LevelPrior())
+    found = seen_by(device, 2).fit(start, device.homodyne.turn_rad, GROUPS, levels=LevelPrior())
     off = np.array(found.modulation.coefficients) - truth.coefficients
     assert np.sqrt(np.mean((off / found.modulation_deviations) ** 2)) < 2
     assert found.conditions.blur == pytest.approx(slm.blur_px**2, abs=0.02)

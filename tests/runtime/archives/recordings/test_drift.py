@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lightpage.runtime.archives.recordings.drift import PageState, described, drift_of, pages_until, steps
+from lightpage.runtime.archives.recordings.drift import PageState, described, drift_of, pages_until, steps_of
 
 NAN = float("nan")
 
@@ -22,7 +22,7 @@ def test_steps_are_those_of_the_walk_and_the_piston_is_unwrapped() -> None:
     assert np.max(np.abs(np.diff(shown))) < 1
     assert drift["piston_rad"].range == pytest.approx(max(shown) - min(shown))
     assert "stroke_relative" not in drift
-    assert described(steps(drift)).startswith("piston 0.")
+    assert described(steps_of(drift)).startswith("piston 0.")
 
 
 def test_a_walk_of_a_pixel_takes_as_many_pages_as_its_steps_say() -> None:
