@@ -33,6 +33,7 @@ from lightpage.runtime.model.execution.estimator_graph import (
 )
 from lightpage.runtime.model.execution.table_graph import HeldTable
 from lightpage.runtime.recalibration.estimator import check_counts
+from lightpage.runtime.recalibration.flat_field import flat_field_of
 from lightpage.runtime.recalibration.from_nominal import recorded_pages
 from lightpage.runtime.recalibration.noise import MOST_STEPS, KnownPhases, deviation_prior_scale, measured_noise
 from lightpage.train.models.likelihood.estimator import Estimate, PhaseEstimator
@@ -60,6 +61,7 @@ class EstimatedDevice:
         last_pair: frames of the last of them with their blemishes.
         pilot_mask: positions of the pilots, bool [ny, nx].
         pilot_phases: phases of the device's own fixed pilots, radians, 1-D; None if they are the profile's.
+        flat_field_pages: hashes of further pages that the flat field is made of, see `hash_frames`.
     """
 
     device: CalibratedDevice
@@ -72,6 +74,7 @@ class EstimatedDevice:
     last_pair: FramePair
     pilot_mask: NDArray[np.bool_]
     pilot_phases: NDArray[np.float32] | None
+    flat_field_pages: tuple[str, ...]
 
     @property
     def steps(self) -> int:
@@ -138,7 +141,10 @@ def estimated_device(
     check_counts(graph, known[0], mask, f"recording {recording.path}, page {used[0]}")
     table |= measured_noise(graph, known, mask, deviation_prior_scale(profile, statistics), steps)
     table[PIXEL_GAINS] = blemishes.gains
-    return EstimatedDevice(device, twin, estimator, graphs, table, optional, pages, last_pair, mask, own)
+    graph = EstimatorGraph(graphs, HeldTable(table), "estimator", None)  # of as many steps as pay
+    flat = flat_field_of(graph, recording, device, used, mask, lambda share: progress("flat field", share))
+    table |= flat.table
+    return EstimatedDevice(device, twin, estimator, graphs, table, optional, pages, last_pair, mask, own, flat.hashes)
 
 
 def coarse_start_pays(

@@ -92,7 +92,7 @@ def export_calibration(
         calibration=calibration.to_toml(),
         camera_bit_depth=bits,
         frame_dtype="uint8" if estimated.frame_dtype == "uint8" else "uint16",
-        calibrated_pages=calibration.calibrated_pages,
+        calibrated_pages=(*calibration.calibrated_pages, *estimated.flat_field_pages),
         table_inputs=tuple(sorted(GraphFile(decoder, str(out)).table_inputs)),
         residual_output=CHI_SQUARE,
         residual_limit=limit,

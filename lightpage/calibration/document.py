@@ -13,7 +13,7 @@ from pydantic import AfterValidator, Field, field_serializer
 
 from lightpage.calibration.calibrate import Registered
 from lightpage.calibration.calibrated_device import CalibratedDevice
-from lightpage.calibration.goodness.causes import unlike_profile
+from lightpage.calibration.goodness.causes import unlike_profile, with_unread
 from lightpage.calibration.goodness.remedies import UNKNOWN, largest
 from lightpage.calibration.goodness.verdict import GOOD, GOOD_SHARE, NOT_JUDGED, USABLE, Goodness, Reading
 from lightpage.calibration.likelihood.statistics import Statistics
@@ -269,13 +269,14 @@ class Calibration(TomlTable):
             judged = goodness.model_copy(update={"verdict": verdict})
             return self.model_copy(update={"goodness": judged, "reading": reading})
         lost = max(0.0, reading.light_bits - reading.air_bits)
+        causes = with_unread(goodness.causes, reading, self.vector)
         other_profile = unlike_profile(self.vector)
-        named = sum(cause.bits for cause in goodness.causes if cause.name != UNKNOWN)
+        named = sum(cause.bits for cause in causes if cause.name != UNKNOWN)
         # what looks like noise of the modulator lowers the information of the light as well
         if verdict == "good" and (other_profile or named > (1 - GOOD_SHARE) * reading.light_bits):
             verdict = "usable"
-        cause = "" if verdict == "good" else other_profile or goodness.cause or largest(goodness.causes)
-        judged = goodness.model_copy(update={"verdict": verdict, "bits_lost": lost, "cause": cause})
+        cause = "" if verdict == "good" else other_profile or goodness.cause or largest(causes)
+        judged = goodness.model_copy(update={"verdict": verdict, "bits_lost": lost, "cause": cause, "causes": causes})
         return self.model_copy(update={"goodness": judged, "reading": reading})
 
     def contradicted(self, cause: str) -> Self:

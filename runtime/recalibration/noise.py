@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lightpage.calibration.calibrate import KnownPage
 from lightpage.calibration.calibrated_device import CalibratedDevice
-from lightpage.calibration.likelihood.flat_field import flat_field
+from lightpage.calibration.likelihood.flat_field import FlatField, flat_field
 from lightpage.calibration.likelihood.known_page_fit import SHIFT
 from lightpage.calibration.likelihood.noise import expected_bits, fitted_noise
 from lightpage.calibration.likelihood.statistics import Statistics
@@ -45,7 +45,7 @@ _LEAST_DIFFERENCE_RAD = 0.01
 """Least difference of two symbols' phases that is one."""
 _PLACING_STEPS = 2
 """Steps, at most, that show where the image of a known page lies."""
-_UNIT_NOISE = np.array([1, 0], np.float32)
+UNIT_NOISE = np.array([1, 0], np.float32)
 """Noise with which concentrations are the Fisher information."""
 
 
@@ -107,7 +107,7 @@ def measured_noise(
         the graph takes one.
     """
     most = MOST_STEPS if steps is None else steps
-    table = {NOISE: np.tile(_UNIT_NOISE, (len(graph.value(NOISE)), 1))} | _without_flat_field(graph, mask)
+    table = {NOISE: np.tile(UNIT_NOISE, (len(graph.value(NOISE)), 1))} | _without_flat_field(graph, mask)
     known = _KnownPages(graph.with_table(table), pages, mask, earlier_flat_field)
     fixed = known.measured(NO_DEVIATIONS, most, until_no_gain=steps is None)
     covariance = graph.value(NUISANCE_COVARIANCE)
@@ -145,7 +145,7 @@ def _without_flat_field(graph: EstimatorGraph, mask: NDArray[np.bool_]) -> Sampl
     return {FLAT_FIELD: np.zeros(mask.shape, np.float32)} if FLAT_FIELD in graph.ports else {}
 
 
-class _Errors(NamedTuple):
+class PhaseErrors(NamedTuple):
     """Errors of the pages' phases after a step.
 
     Attributes:
@@ -155,6 +155,18 @@ class _Errors(NamedTuple):
 
     phases: Real
     information: Real
+
+    @classmethod
+    def of(
+        cls, answers: Sequence[NDArray[np.float32]], pages: Sequence[KnownPhases], mask: NDArray[np.bool_]
+    ) -> PhaseErrors:
+        """Compare answers p of unit noise, [2, ny, nx] each, with the known phases up to the piston of the pilots."""
+        phases: list[Real] = []
+        for p, page in zip(answers, pages, strict=True):
+            error = wrapped(np.arctan2(p[1], p[0]).astype(np.float64) - page.phases)
+            piston = np.angle(np.mean(np.exp(1j * error[mask])))
+            phases.append(np.asarray(wrapped(error - piston)))
+        return cls(np.stack(phases), np.stack([np.hypot(*p).astype(np.float64) for p in answers]))
 
     def noise(self, flat_fields: Real, data: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Fit the noise of the data symbols, [2], where each page has a flat field, [K, ny, nx]."""
@@ -170,15 +182,13 @@ class _Step(NamedTuple):
 
     Attributes:
         errors: errors of their phases.
-        flat_field: flat field that helps most, radians [ny, nx].
-        by_others: for each page a flat field that it has no part in, radians [K, ny, nx].
-        noise: noise with these flat fields, [2].
+        flat_field: flat field that helps most.
+        noise: noise with it, [2].
         bits: expected information, bits a symbol.
     """
 
-    errors: _Errors
-    flat_field: Real
-    by_others: Real
+    errors: PhaseErrors
+    flat_field: FlatField
     noise: NDArray[np.float32]
     bits: float
 
@@ -221,10 +231,9 @@ class _KnownPages:
     ) -> None:
         self._graph = graph
         self._pages = pages
-        self._feeds = [_placed(graph, page.feeds(mask)) for page in pages]
+        self._feeds = [placed(graph, page.feeds(mask)) for page in pages]
         self._mask = mask
         self._data = ~mask
-        self._no_flat_fields = np.zeros((len(pages), *mask.shape))
         self._earlier = earlier_flat_field
         self._takes_flat_field = FLAT_FIELD in graph.ports
         self._distinct = all(_differ(one, other) for one, other in itertools.combinations(pages, 2))
@@ -243,10 +252,10 @@ class _KnownPages:
         for number in range(most + 1):
             if number:
                 states = [graph.step(*each, number) for each in zip(states, self._feeds, strict=True)]
-            errors = self._errors([state["p"] for state in states])
-            flat, by_others = self._flat_field(errors)
-            noise = errors.noise(by_others, self._data)
-            step = _Step(errors, flat, by_others, noise, errors.bits(noise, self._data))
+            errors = PhaseErrors.of([state["p"] for state in states], self._pages, self._mask)
+            flat = self._flat_field(errors)
+            noise = errors.noise(flat.by_others, self._data)
+            step = _Step(errors, flat, noise, errors.bits(noise, self._data))
             steps.append(step)
             if until_no_gain and number > _PATIENCE and step.bits < steps[-1 - _PATIENCE].bits + _LEAST_GAIN_BITS:
                 break
@@ -254,39 +263,56 @@ class _KnownPages:
         while until_no_gain and len(steps) > 2 and steps[-1].bits < steps[-2].bits + _LEAST_GAIN_BITS:
             steps.pop()
         last = steps[-1]
-        rows = [*(step.errors.noise(last.by_others, self._data) for step in steps[:-1]), last.noise]
+        rows = [*(step.errors.noise(last.flat_field.by_others, self._data) for step in steps[:-1]), last.noise]
         variance = float(np.median(last.noise[0] / last.errors.information[:, self._data] + last.noise[1]))
-        return _Measured(np.stack(rows), last.flat_field, last.bits, variance)
+        return _Measured(np.stack(rows), last.flat_field.phases, last.bits, variance)
 
-    def _errors(self, answers: Sequence[NDArray[np.float32]]) -> _Errors:
-        """Compare the pages' answers p [2, ny, nx], of unit noise, with the known phases."""
-        phases: list[Real] = []
-        for p, page in zip(answers, self._pages, strict=True):
-            error = wrapped(np.arctan2(p[1], p[0]).astype(np.float64) - page.phases)
-            piston = np.angle(np.mean(np.exp(1j * error[self._mask])))
-            phases.append(np.asarray(wrapped(error - piston)))
-        return _Errors(np.stack(phases), np.stack([np.hypot(*p).astype(np.float64) for p in answers]))
-
-    def _flat_field(self, errors: _Errors) -> tuple[Real, Real]:
-        """Return the flat field [ny, nx] that helps most, and for each page one that it has no part in, [K, ny, nx]."""
-        plain = errors.noise(self._no_flat_fields, self._data)
-        candidates: list[tuple[Real, Real]] = []
-        if self._takes_flat_field and self._distinct:
-            variance = np.mean(plain[0] / errors.information + plain[1], axis=0)
-            candidates.append(flat_field(errors.phases, variance))
-        if self._takes_flat_field and self._earlier is not None and self._earlier.any():
-            candidates.append((np.asarray(self._earlier, np.float64), self._no_flat_fields + self._earlier))
-        best = self._no_flat_fields[0], self._no_flat_fields
-        most = errors.bits(plain, self._data) + _LEAST_GAIN_BITS
-        for flat, by_others in candidates:
-            bits = errors.bits(errors.noise(by_others, self._data), self._data)
-            if bits >= most:
-                best = flat, by_others
-                most = bits
-        return best
+    def _flat_field(self, errors: PhaseErrors) -> FlatField:
+        """Return the flat field that helps most."""
+        if not self._takes_flat_field:
+            return FlatField(np.zeros(self._mask.shape), np.zeros_like(errors.phases))
+        return best_flat_field(errors, self._data, self._earlier, distinct=self._distinct)
 
 
-def _placed(graph: EstimatorGraph, feeds: dict[str, NDArray[np.generic]]) -> dict[str, NDArray[np.generic]]:
+def best_flat_field(
+    errors: PhaseErrors,
+    data: NDArray[np.bool_],
+    earlier: NDArray[np.floating] | None = None,
+    *,
+    distinct: bool = True,
+    judges: slice = slice(None),
+) -> FlatField:
+    """Choose the flat field with which pages are read best: none, the earlier one, or each page that of the others.
+
+    Args:
+        errors: errors of known pages.
+        data: symbols that are no pilots, [ny, nx].
+        earlier: earlier flat field, radians [ny, nx]; None if there is none.
+        distinct: whether the pages show different symbols. Otherwise errors of one page look like a flat field.
+        judges: pages that judge.
+    """
+    none = np.zeros_like(errors.phases)
+    plain = errors.noise(none, data)
+    candidates: list[FlatField] = []
+    if distinct:
+        candidates.append(flat_field(errors.phases, np.mean(plain[0] / errors.information + plain[1], axis=0)))
+    if earlier is not None and earlier.any():
+        candidates.append(FlatField(np.asarray(earlier, np.float64), none + earlier))
+
+    def bits(flat: FlatField) -> float:
+        judged = PhaseErrors(errors.phases[judges], errors.information[judges])
+        return judged.bits(judged.noise(flat.by_others[judges], data), data)
+
+    best = FlatField(none[0], none)
+    most = bits(best) + _LEAST_GAIN_BITS
+    for candidate in candidates:
+        if (gained := bits(candidate)) >= most:
+            best = candidate
+            most = gained
+    return best
+
+
+def placed(graph: EstimatorGraph, feeds: dict[str, NDArray[np.generic]]) -> dict[str, NDArray[np.generic]]:
     """Return what a page is fed with, and the registration where its image lies, as a tracker feeds it.
 
     Known pages of a device that walks lie off the calibration, which has their mean. Pages that are read do not.

@@ -66,6 +66,7 @@ from lightpage.runtime.model.execution.session import open_session
 from lightpage.runtime.model.execution.table_graph import GraphFile
 from lightpage.runtime.model.execution.twin import OnnxTwin
 from lightpage.runtime.recalibration.estimator import check_counts
+from lightpage.runtime.recalibration.flat_field import flat_field_of
 from lightpage.runtime.recalibration.known_pages import KnownPages
 from lightpage.runtime.recalibration.noise import MOST_STEPS, KnownPhases, measured_noise
 from lightpage.runtime.recalibration.recalibration import recalibrate
@@ -284,6 +285,32 @@ def test_an_error_that_repeats_at_each_symbol_becomes_a_flat_field(bundle: Path,
         (phase,) = graph.with_table(table).run(["phase"], shifted[2].feeds(mask))
         errors.append(wrapped(phase - shifted[2].phases)[~mask].std())
     assert errors[1] < 0.6 * errors[0]
+
+
+def test_a_flat_field_takes_in_further_pages_that_are_read_better_with_it(
+    bundle: Path, small_device: list[str], tmp_path: Path
+) -> None:
+    decoder = Decoder.load(bundle, 1)
+    graph = decoder.graph
+    assert isinstance(graph, EstimatorGraph)
+    pattern = np.rint(np.random.default_rng(0).normal(0, 2, PROFILE.page_shape)).astype(np.int64)  # levels of 256
+    mask = decoder.bundle.pilot_mask
+    with Recording.open(small_device[3]) as usual:
+        device = decoder.bundle.calibration.device(PROFILE, usual.references())
+        assert flat_field_of(graph, usual, device, [0, 1], mask) == ({}, ())
+        path = tmp_path / "R.h5"
+        with RecordingWriter(path, PROFILE, 256, usual.bit_depth, usual.references()) as writer:
+            for page in range(usual.pages):
+                symbols = usual.symbols(page)
+                assert symbols is not None
+                writer.append((symbols.astype(np.int64) - pattern) % 256, usual.frames(page))
+    with Recording.open(path) as repeating:
+        grown = flat_field_of(graph, repeating, device, [0, 1], mask)
+        two_pages = flat_field_of(graph, repeating, device, [*range(6)], mask)
+    assert len(grown.hashes) == 2  # of six further pages, four stay unseen
+    expected = 2 * np.pi * pattern / 256
+    assert np.corrcoef(grown.table[FLAT_FIELD].ravel(), expected.ravel())[0, 1] > 0.95
+    assert two_pages == ({}, ())  # the last two are kept to judge
 
 
 def test_the_pages_of_a_calibration_are_enough_for_a_first_code(

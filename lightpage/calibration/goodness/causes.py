@@ -14,9 +14,12 @@ import scipy
 from numpy.typing import NDArray
 
 from lightpage.calibration.goodness.equations import coarse_places, equations_of_contrast, equations_of_fit
+from lightpage.calibration.goodness.ghost import changes_by_ghost
 from lightpage.calibration.goodness.light import PageLight, places_on_facet, radius2
-from lightpage.calibration.goodness.remedies import CONTRAST, NEIGHBOURS, WALLS
-from lightpage.calibration.parameters import NAMES, PRIORS, indices
+from lightpage.calibration.goodness.remedies import CAMERA_TILT, CONTRAST, GHOST, NEIGHBOURS, UNKNOWN, WALLS, cause_of
+from lightpage.calibration.goodness.verdict import Cause, Reading
+from lightpage.calibration.parameters import NAMES, PRIORS, as_dict, indices
+from lightpage.calibration.waves.wave_model import tilts_of_cameras_apart
 from lightpage.waves.parallel import in_parallel
 
 Real = NDArray[np.float64]
@@ -34,6 +37,12 @@ _CHANCE = 4.0
 """Least ratio of the power that a cause explains to the power of noise that its columns explain by chance."""
 _MOST_CAUSES = 6
 """Largest number of causes that are taken off."""
+USUALLY_READ = 0.97
+"""Share of the light's information that a decoder reads of a usual device."""
+_LEAST_UNREAD = 0.05
+"""Least information that a reading lacks beyond what causes cost, for it to have a cause, bits a symbol."""
+_TILTED_RAD = 0.1
+"""Tilt of the cameras apart from which on a decoder reads less, radians."""
 _UNLIKELY = 8.0
 """Least deviation of a length that shows another device than the profile's, in standard deviations of the prior."""
 
@@ -49,6 +58,27 @@ def unlike_profile(parameters: Real) -> str:
         return ""
     name = NAMES[furthest].removesuffix("_relative").replace("_", " ")
     return f"a {name} {parameters[furthest]:+.1%} off the profile's: is this the device's profile?"
+
+
+def with_unread(causes: tuple[Cause, ...], reading: Reading, parameters: Real) -> tuple[Cause, ...]:
+    """Add to the causes what pages lose that the fit explains: their decoder predicts light less exactly.
+
+    Decoders follow cameras that are tilted otherwise than each other only roughly.
+
+    Args:
+        causes: causes of what the fit does not explain, the largest first, and what is unknown last.
+        reading: reading of known pages.
+        parameters: of the device, [P].
+    """
+    expected = USUALLY_READ * reading.light_bits - sum(cause.bits for cause in causes)
+    unread = expected - reading.air_bits
+    if unread < _LEAST_UNREAD:
+        return causes
+    tilted = np.hypot(*tilts_of_cameras_apart(as_dict(parameters))) > _TILTED_RAD
+    name = CAMERA_TILT if tilted else UNKNOWN
+    known = sum(cause.bits for cause in causes if cause.name == name)
+    added = [*(cause for cause in causes if cause.name != name), cause_of(name, known + unread)]
+    return tuple(sorted(added, key=lambda cause: (cause.name == UNKNOWN, -cause.bits)))
 
 
 def shares_of(
@@ -158,11 +188,6 @@ def _suspects(light: PageLight) -> Iterator[tuple[str, list[Real]]]:
     def by_geometry(name: str) -> list[Complex]:
         return [light.changed(None, None, **{name: step}).to_cameras(page) - here for step in _STEPS]
 
-    def ghost() -> list[Complex]:
-        length = light.waves.channel.geometry.pipe_length_m
-        passed = light.changed(pipe_length_m=3 * length).to_cameras(page)
-        return [passed, 1j * passed]
-
     def mixed() -> list[Complex]:
         pages = [factor * page * step**power for power, factor in ((1, 1j), (2, 1)) for step in light.steps]
         return [light.waves.to_cameras(each)[:, *light.every] for each in pages]
@@ -173,11 +198,11 @@ def _suspects(light: PageLight) -> Iterator[tuple[str, list[Real]]]:
         "lens askew": lambda: at_exit(across**2 - up**2, across * up),
         "modulator focus": lambda: at_entrance(np.ones_like(x)),
         "modulator bent": lambda: [coarse.to_cameras(1j * page * x**i * y**j) for i, j in _BENDS],
-        "camera tilt": tilted,
+        CAMERA_TILT: tilted,
         "modulator tilt": lambda: at_entrance(x, y),
         WALLS: lambda: by_geometry("pipe_height_relative"),
         "taper": lambda: by_geometry("pipe_taper"),
-        "ghost": ghost,
+        GHOST: lambda: changes_by_ghost(light),
         NEIGHBOURS: mixed,
     }
     changes = in_parallel(lambda name: [light.equations_of(each) for each in suspects[name]()], [*suspects])

@@ -115,6 +115,11 @@ class PageLight:
         """Residual of the model, as light of both cameras that would explain it, complex [2, Gy, Gx]."""
         return self._explaining_light(self.count_residual)
 
+    def residual_by_camera(self) -> list[Complex]:
+        """Residual as light that would explain one camera's alone, twice as bright, complex [2, Gy, Gx] each."""
+        residual = self.residual
+        return [residual * chosen for chosen in 2 * np.eye(2)[:, :, None, None]]
+
     def observed_change(self, change: Complex) -> Complex:
         """Estimate a small change of both cameras' light from their equations, which miss its other quadrature."""
         return self._explaining_light((change / self.amplitude * self._count_gradient().conj()).real)
@@ -194,6 +199,11 @@ class PageLight:
             counts = level * (1 + 2 * self.counts[camera])
             excess = CountCurve.measured(expected[self.visible], (counts - expected)[self.visible])
             self._excess[camera] = excess.at(expected) / (2 * level)
+
+    def correct_symbols(self, errors: Complex) -> None:
+        """Correct the model by relative errors of the modulator's samples, [ny samples, nx samples]."""
+        if errors.any():
+            self.fields = self.fields + self.waves.to_cameras(errors * self.page)
 
     def equations(self, residual: Real) -> Real:
         """Weigh equations [2, Gy, Gx], or those of the coarse grid, by their noise; on the coarse grid, flat."""

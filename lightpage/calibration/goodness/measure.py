@@ -29,13 +29,16 @@ from lightpage.calibration.goodness.camera_faults import (
 )
 from lightpage.calibration.goodness.causes import shares_of, unlike_profile
 from lightpage.calibration.goodness.equations import equations_near, noise_equations
+from lightpage.calibration.goodness.ghost import ghost_amplitude
 from lightpage.calibration.goodness.light import PageLight
 from lightpage.calibration.goodness.page_errors import (
     Explained,
-    dead_pixels,
+    flicker_variance,
     lost_bits,
+    named_outliers,
+    outlier_bits,
+    outliers,
     steps_to_neighbours,
-    without_flicker,
     without_levels,
     without_neighbours,
 )
@@ -45,6 +48,7 @@ from lightpage.calibration.goodness.remedies import (
     DEAD_PIXELS,
     DUST,
     FLICKER,
+    GHOST,
     LEVELS,
     NEIGHBOURS,
     OTHER_SYMBOLS,
@@ -85,7 +89,7 @@ _MOST_RATIO = 1e6
 _FOREIGN = 0.1
 """Least mean square of the symbols' relative errors that shows the light of other symbols."""
 _LEAST_MEASURED = 0.03
-"""Least information that unequal walls cost by their estimate, bits a symbol, for their difference to be measured."""
+"""Least information that a cause costs by its estimate, bits a symbol, for its size to be measured."""
 _LEAST_BITS = 0.005
 """Least information that a named cause costs, bits a symbol."""
 
@@ -116,6 +120,7 @@ class _PageErrors(NamedTuple):
         gain: gain of each symbol, [ny, nx].
         visible: symbols whose light both cameras see, [ny, nx].
         errors: relative errors without their smooth part and without the page's edges.
+        by_camera: the same by either camera alone, [2, ny, nx].
         phases: phases of the levels, without the page's edges.
         neighbourhood: see `steps_to_neighbours`, without the page's edges.
     """
@@ -126,8 +131,18 @@ class _PageErrors(NamedTuple):
     gain: NDArray[np.floating]
     visible: NDArray[np.bool_]
     errors: Complex
+    by_camera: Complex
     phases: Real
     neighbourhood: Real
+
+    def without(self, outlying: NDArray[np.bool_]) -> _PageErrors:
+        """Return the page without errors of outlying symbols, [ny, nx], whose light is then as measured."""
+        self.light.correct_symbols(self.on_modulator(np.where(outlying, self.errors, 0)))
+        return self._replace(errors=np.where(outlying, 0, self.errors))
+
+    def on_modulator(self, errors: Complex) -> Complex:
+        """Errors of the modulator's samples by those of symbols, without the page's edges."""
+        return on_modulator(np.pad(errors, _EDGE), self.light.waves.samples)
 
     def rough(self, leaving: Complex) -> Complex:
         """Errors of symbols by light on the exit facet, see `errors`."""
@@ -158,6 +173,9 @@ def measure_goodness(
         CalibrationError: the cameras see the light of no symbol.
     """
     every = list(in_parallel(lambda page: _page_errors(twin, page, progress), pages))
+    outlying = outliers([page.by_camera for page in every])
+    wrong_symbols = np.where(outlying, every[0].errors, 0)
+    every = [page.without(outlying) for page in every]
     page = every[0]
     light = page.light
     back = light.waves.back_to_exit
@@ -184,8 +202,8 @@ def measure_goodness(
     other_profile = unlike_profile(pages[0].device.parameters)
     by_symbols = {LEVELS: by_level, NEIGHBOURS: by_neighbours}
     causes: tuple[Cause, ...] = ()
-    if lost >= explained_from or contrast_bits(page.terms) >= explained_from:
-        causes = _causes(every, errors, by_symbols, unexplained, drawn, amount, gains, values=values)
+    if max(lost, outlier_bits(wrong_symbols, noise[1]), contrast_bits(page.terms)) >= explained_from:
+        causes = _causes(every, errors, wrong_symbols, by_symbols, unexplained, drawn, amount, gains, values=values)
     if lost >= GOOD and not causes:
         causes = (cause_of(UNKNOWN, lost),)
     cause = other_profile or (largest(causes) if lost >= GOOD else "")
@@ -223,16 +241,18 @@ def _page_errors(twin: Twin, page: ShownPage, progress: Callable[[float], None] 
     if not visible.any():
         raise CalibrationError("calibration, verdict", "no symbol whose light both cameras see", "some")
     errors = _rough(light.errors(residual), gain, visible)
+    by_camera = np.stack([_rough(light.errors(back(seen)), gain, visible) for seen in light.residual_by_camera()])
     phases = np.mod(np.angle(page.symbols), 2 * np.pi)
     inside = slice(_EDGE, -_EDGE), slice(_EDGE, -_EDGE)
     neighbourhood = steps_to_neighbours(phases)[:, *inside]
     progress(0.6)
-    return _PageErrors(light, terms, residual, gain, visible, errors, phases[inside], neighbourhood)
+    return _PageErrors(light, terms, residual, gain, visible, errors, by_camera, phases[inside], neighbourhood)
 
 
 def _causes(
     pages: Sequence[_PageErrors],
     errors: Complex,
+    wrong_symbols: Complex,
     by_symbols: dict[str, Explained],
     unexplained: float,
     drawn: Complex,
@@ -245,7 +265,8 @@ def _causes(
 
     Args:
         pages: known pages.
-        errors: errors of the first one's symbols without those of levels and neighbours.
+        errors: errors of the first one's symbols without those of outliers, levels and neighbours.
+        wrong_symbols: errors of its outliers, zero elsewhere.
         by_symbols: what levels and neighbours explain of them, by the name of the cause.
         unexplained: phase variance that a better model would explain.
         drawn: errors as noise alone makes them. An estimator by the fitted waves adds no errors of its own.
@@ -254,18 +275,12 @@ def _causes(
         values: whether the sizes of causes are measured too.
     """
     page = pages[0]
-    kept, flicker = without_flicker([each.errors for each in pages], [each.phases for each in pages])
-    kept = [without_levels(each, one.phases).residual for each, one in zip(kept, pages, strict=True)]
+    flicker = flicker_variance([each.errors for each in pages], [each.phases for each in pages])
     variance = max(float(np.mean(drawn.imag**2)), _TINY)
-    dead = dead_pixels(kept, variance)
     variances = {name: each.variance for name, each in by_symbols.items()}
     variances |= {FLICKER: flicker, LEVELS: max(0.0, variances[LEVELS] - flicker)}
     light = page.light
-    explained = np.zeros(page.gain.shape, np.complex128)
-    parts = sum((each.part for each in by_symbols.values()), np.where(dead.where, kept[0], 0))
-    explained[_EDGE:-_EDGE, _EDGE:-_EDGE] = parts
-    known = on_modulator(explained, light.waves.samples)
-    rest = max(0.0, unexplained - dead.power)
+    known = page.on_modulator(by_symbols[LEVELS].part + by_symbols[NEIGHBOURS].part)
     dark = np.stack([shadows(*_frames_of(pages, camera)) for camera in range(2)])
     places = {DUST: equations_near(light, dark)}
     if gains is not None:
@@ -274,19 +289,25 @@ def _causes(
     shares = shares_of(light, noise, known, places)
     contrast = named_contrast(page.terms)
     for name, share in shares.items():
-        variances[contrast or CONTRAST if name == CONTRAST else name] = share * rest
-    wrong = sum(variances.values()) + max(0.0, rest * (1 - sum(shares.values())))
-    lost = max(0.0, lost_bits(np.where(dead.where, 0, page.errors), variance) - lost_bits(drawn, variance))
+        variances[contrast or CONTRAST if name == CONTRAST else name] = share * unexplained
+    wrong = sum(variances.values()) + max(0.0, unexplained * (1 - sum(shares.values())))
+    lost = max(0.0, lost_bits(page.errors, variance) - lost_bits(drawn, variance))
     bits = {name: lost * each / max(wrong, _TINY) for name, each in variances.items()}
-    bits[DEAD_PIXELS] = dead.bits
+    bits[DEAD_PIXELS] = outlier_bits(wrong_symbols, variance)
     if contrast == VIBRATION:
         bits[VIBRATION] = bits.get(VIBRATION, 0.0) + contrast_bits(page.terms)
     unknown = lost * max(0.0, 1 - sum(variances.values()) / max(wrong, _TINY))
     foreign = np.mean(np.abs(errors) ** 2) > _FOREIGN
     bits[OTHER_SYMBOLS if foreign else UNKNOWN] = unknown
-    details = {DEAD_PIXELS: str(dead), DUST: named_shadows(dark), REFERENCE_EXPOSURE: named_exposures(page.terms)}
+    details = {
+        DEAD_PIXELS: named_outliers(wrong_symbols != 0),
+        DUST: named_shadows(dark),
+        REFERENCE_EXPOSURE: named_exposures(page.terms),
+    }
     if values and bits.get(WALLS, 0.0) >= _LEAST_MEASURED:
         details[WALLS] = str(wall_difference(light) or "")
+    if values and bits.get(GHOST, 0.0) >= _LEAST_MEASURED:
+        details[GHOST] = str(ghost_amplitude(light))
     causes = [cause_of(name, each, details.get(name, "")) for name, each in bits.items() if each >= _LEAST_BITS]
     if lost < GOOD and all(cause.name == UNKNOWN for cause in causes):
         return ()

@@ -9,22 +9,27 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from lightpage.words import counted
+
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
 _NAMED = 3
 """Places that are named."""
-_OUTLIER = 4.5
-"""Deviations from which on the root mean square of a symbol's errors on two pages is none of noise: chance has it in
-one symbol of 10^8."""
-_ON_EACH = 0.5
-"""Least error on each page, over the root mean square: a symbol that is wrong on one page alone has no dead pixel."""
+_BY_CHANCE = 1e-8
+"""Probability that noise alone makes a symbol an outlier."""
+_ON_EACH = 4.0
+"""Least square of an outlier's error on each page by either camera, over the variance of errors. A symbol that is wrong
+on one page alone has no dead pixel; one that is wrong by one camera alone has dust on it."""
+_AROUND = 9
+"""Side, symbols, of the square in which errors are usual."""
+_OF_MEDIAN = 1.4826
+"""Standard deviation of normal errors over the median of their magnitudes."""
 _BLOCK = 5
 """Side, symbols, of the squares over which the variance of errors is compared with that of noise."""
-_LEAST_ERROR = 0.03
-"""Least error of a symbol with a dead pixel, relative to its light: half of what one pixel of 16 causes."""
 _MOST_DEAD = 0.1
 """Largest share of symbols with dead pixels; more are symbols that were not written."""
+_TINY = 1e-30
 
 
 class Explained(NamedTuple):
@@ -41,45 +46,21 @@ class Explained(NamedTuple):
     variance: float
 
 
-class DeadPixels(NamedTuple):
-    """Symbols with dead pixels of the modulator.
-
-    Attributes:
-        where: symbols, [ny, nx].
-        power: mean square of their errors of phase, over all symbols.
-        bits: information that they lose, bits a symbol of the page.
-    """
-
-    where: NDArray[np.bool_]
-    power: float
-    bits: float
-
-    def __str__(self) -> str:
-        """First places in words."""
-        places = [f"row {row}, column {column}" for row, column in np.argwhere(self.where)[:_NAMED]]
-        count = np.count_nonzero(self.where)
-        return f" ({count} symbols: {'; '.join(places)}{'; ...' if count > _NAMED else ''})" if count else ""
-
-
-def without_flicker(errors: Sequence[Complex], phases: Sequence[Real]) -> tuple[list[Complex], float]:
-    """Take the change of the modulator's stroke from page to page off the errors of several pages.
+def flicker_variance(errors: Sequence[Complex], phases: Sequence[Real]) -> float:
+    """Return the phase variance by changes of the modulator's stroke from page to page, rad^2; 0 for one page.
 
     Args:
         errors: relative errors of each page's symbols, [ny, nx].
         phases: phases of their levels, [ny, nx].
-
-    Returns:
-        Errors without it, and its variance, rad^2.
     """
     if len(errors) < 2:
-        return list(errors), 0.0
+        return 0.0
     ramps = [page - page.mean() for page in phases]
     slopes = np.array([np.sum(e.imag * ramp) / np.sum(ramp**2) for e, ramp in zip(errors, ramps, strict=True)])
     slopes = slopes - slopes.mean()
     chance = np.mean([np.mean(e.imag**2) / e.size for e in errors])
     variance = float(np.sum(slopes**2) / (len(slopes) - 1) * np.mean([np.mean(ramp**2) for ramp in ramps]))
-    kept = [e - 1j * slope * ramp for e, slope, ramp in zip(errors, slopes, ramps, strict=True)]
-    return kept, max(0.0, variance - 2 * float(chance))
+    return max(0.0, variance - 2 * float(chance))
 
 
 def without_levels(errors: Complex, phases: Real) -> Explained:
@@ -141,18 +122,41 @@ def lost_bits(errors: Complex, noise: float) -> float:
     return float(np.mean(np.log2(np.maximum(variance / noise, 1)))) / 2
 
 
-def dead_pixels(errors: Sequence[Complex], noise: float) -> DeadPixels:
-    """Find symbols whose light is wrong on all of several pages.
+def outliers(errors: Sequence[Complex]) -> NDArray[np.bool_]:
+    """Find symbols whose light is wrong on each of several pages by either camera, as by dead pixels of the modulator.
+
+    A dark pixel changes the amplitude of its symbol, which noise of the modulator hardly does. So errors of amplitude
+    and of phase count by their own deviations, which are those of the symbols around.
 
     Args:
-        errors: relative errors of each page's symbols, [ny, nx].
+        errors: relative errors of each page's symbols by either camera, [2, ny, nx].
+
+    Returns:
+        Where they are, bool [ny, nx]; nowhere with one page, which shows as well what was not written.
+    """
+    parts = np.array([part for page in errors for camera in page for part in (camera.real, camera.imag)])
+    usual = [scipy.ndimage.median_filter(np.abs(part), _AROUND) * _OF_MEDIAN for part in parts]
+    by_view = np.sum(((parts / np.maximum(usual, _TINY)) ** 2).reshape(-1, 2, *parts.shape[1:]), axis=1)
+    most = scipy.stats.chi2.isf(_BY_CHANCE, len(parts))
+    where = (by_view.sum(axis=0) > most) & (by_view.min(axis=0) > _ON_EACH)
+    return np.asarray(where & (len(errors) > 1) & (np.mean(where) < _MOST_DEAD))
+
+
+def outlier_bits(errors: Complex, noise: float) -> float:
+    """Information that outliers lose, bits a symbol: an estimator that does not expect such errors trusts its phases.
+
+    Args:
+        errors: relative errors of the outliers, zero elsewhere, [ny, nx].
         noise: variance of a symbol's phase by noise.
     """
-    magnitudes = np.abs(errors)
-    typical = np.sqrt(np.mean(magnitudes**2, axis=0))
-    usual = max(float(scipy.stats.median_abs_deviation(each.imag, axis=None, scale="normal")) for each in errors)
-    where = (typical > max(_OUTLIER * usual, _LEAST_ERROR)) & (magnitudes.min(axis=0) > _ON_EACH * typical)
-    if len(errors) < 2 or np.mean(where) > _MOST_DEAD:
-        where = np.zeros_like(where)
-    wrong = np.where(where, errors[0].imag ** 2, 0)
-    return DeadPixels(where, float(np.mean(wrong)), float(np.mean(np.log2(1 + wrong / noise))) / 2)
+    held = np.log2(2 * np.pi) - np.log2(2 * np.pi * np.e * noise) / 2
+    return float(np.mean(np.minimum(np.abs(errors) ** 2 / noise * np.log2(np.e) / 2, max(0.0, held))))
+
+
+def named_outliers(where: NDArray[np.bool_]) -> str:
+    """Name the first places of outliers, bool [ny, nx], in words; empty where there are none."""
+    places = [f"row {row}, column {column}" for row, column in np.argwhere(where)[:_NAMED]]
+    count = np.count_nonzero(where)
+    return (
+        f" ({counted(int(count), 'symbol')}: {'; '.join(places)}{'; ...' if count > _NAMED else ''})" if count else ""
+    )

@@ -22,6 +22,7 @@ class Remedy(NamedTuple):
 
 BEND = "bend"
 BLACK_LEVEL = "black level"
+CAMERA_TILT = "camera tilt"
 CONTRAST = "contrast"
 LEVELS = "levels"
 NEIGHBOURS = "crosstalk"
@@ -30,6 +31,7 @@ UNKNOWN = "unknown"
 CAMERA_PIXELS = "camera pixels"
 DUST = "dust"
 FLICKER = "flicker"
+GHOST = "ghost"
 DEAD_PIXELS = "dead modulator pixels"
 REFERENCE_EXPOSURE = "reference exposure"
 VIBRATION = "vibration"
@@ -47,14 +49,14 @@ REMEDIES = {
     "modulator bent": Remedy(
         "a phase over the page: the modulator is not flat", "load the modulator's flatness correction"
     ),
-    "camera tilt": Remedy("a focus that changes over the image: tilted cameras", "stand the cameras upright"),
+    CAMERA_TILT: Remedy("a focus that changes over the image: tilted cameras", "stand the cameras upright"),
     "modulator tilt": Remedy("a focus that changes over the page: a tilted modulator", "stand the modulator upright"),
     WALLS: Remedy(
         "walls of the pipe that are not equally far apart in x and y, or that polarise light as such walls would",
         "ask the pipe's maker for its two widths; polarise the light along a wall",
     ),
     "taper": Remedy("a pipe that tapers", "ask the pipe's maker for the widths of both facets"),
-    "ghost": Remedy("light that passes the pipe three times", "coat the facets against reflections, or wedge one"),
+    GHOST: Remedy("light that passes the pipe three times", "coat the facets against reflections, or wedge one"),
     CONTRAST: Remedy("a wrong ratio of interference and signal", "record references and pages alike"),
     REFERENCE_EXPOSURE: Remedy(
         "references of another exposure than the pages", "record references with the pages' exposure, each camera's own"

@@ -172,11 +172,19 @@ class DeviceFit:
             statistics = moved_statistics
             if solution.gain < _LEAST_GAIN * len(solution.step):
                 break
-        goodness = self._goodness(current, conditions, fit.pages)
+        goodness = self._goodness(current, conditions, [*fit.pages, *self._fitted(fit, current, statistics)])
         self._progress(1.0)
         at_mean = _at_page(current.parameters, np.mean([page.nuisance for page in fit.pages], axis=0))
         parameters = np.where(registered.deviations > 0, at_mean, current.parameters)
         return replace(current, parameters=parameters, goodness=goodness), statistics
+
+    def _fitted(self, fit: KnownPageFit, registered: Registered, statistics: Statistics) -> list[FittedPage]:
+        """Fit the nuisance parameters of pages that are judged and were not scored."""
+        rest = KnownPageFit(self._likelihood, fit.table, self._pages[len(fit.pages) : _JUDGED], registered.modulation)
+        rest.fit_gains(statistics)
+        for page in rest.pages:
+            rest.fit_nuisance(page)
+        return rest.pages
 
     def _goodness(self, registered: Registered, conditions: LaunchConditions, pages: Sequence[FittedPage]) -> Goodness:
         """Judge a registration by the light of its first page; the next one tells causes that stay, and that change."""

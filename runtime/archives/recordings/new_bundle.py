@@ -28,6 +28,7 @@ from lightpage.runtime.model.decoding.image_tracker import tracker_for
 from lightpage.runtime.model.execution.estimator_graph import EstimatorGraph
 from lightpage.runtime.model.execution.twin import OnnxTwin
 from lightpage.runtime.recalibration.estimator import GraphLikelihood, check_counts, measured_table
+from lightpage.runtime.recalibration.flat_field import flat_field_of
 from lightpage.runtime.recalibration.from_nominal import neutral_graph, recorded_pages
 from lightpage.runtime.recalibration.noise import KnownPhases
 from lightpage.runtime.recalibration.recalibration import golden_page, refitted_bundle
@@ -110,8 +111,8 @@ def bundle_by_graphs(
     Args:
         decoder: decoder of the other bundle; see `check_graphs`.
         calibration: calibration of the recording's device, with statistics of the counts.
-        recording: recording with the pages of the calibration. Other pages with known symbols choose the code of user
-            bytes.
+        recording: recording with the pages of the calibration. Other pages with known symbols make the flat field, say
+            what will be read, and choose the code of user bytes.
         out: new path, a zip where it ends in .zip.
         name: name of the bundle; the profile's if left out.
         version: its version; its name, the time and a hash if left out.
@@ -138,9 +139,12 @@ def bundle_by_graphs(
     result = replace(result, table={**result.table, **measured})
     pilots = decoder.of_bundle(refitted_bundle(decoder.bundle, result)).pilots(256)
     result = replace(result, table={**result.table, **pilot_tensors(pilots)})
-    fitted = refitted_bundle(decoder.bundle, result)
-    new = decoder.of_bundle(fitted)
+    new = decoder.of_bundle(refitted_bundle(decoder.bundle, result))
     assert isinstance(new.graph, EstimatorGraph)  # as that of `decoder`
+    flat = flat_field_of(
+        new.graph, recording, device, used, mask, lambda share: progress("flat field", 0.6 + 0.1 * share)
+    )
+    fitted = refitted_bundle(decoder.bundle, replace(result, table={**result.table, **flat.table}))
     for_corrected = new.graph.with_table({PIXEL_GAINS: blemishes.unit_gains})
     check_counts(for_corrected, KnownPhases.of(known[0], device), mask, f"recording {recording.path}, page {used[0]}")
     swapped = FramePair(pair.quadrature, pair.in_phase)
@@ -152,7 +156,7 @@ def bundle_by_graphs(
             "version": version or version_of(name, created, calibration.to_toml().encode()),
             "created": created.isoformat(timespec="seconds"),
             "metrics": {},
-            "calibrated_pages": calibration.calibrated_pages,
+            "calibrated_pages": (*calibration.calibrated_pages, *flat.hashes),
             "residual_limit": residual_limit(
                 new.infer(pair, doubtful=True).residual, new.infer(swapped, doubtful=True).residual
             ),

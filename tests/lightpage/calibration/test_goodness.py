@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.goodness.frame_noise import noise_curve, noise_like, on_pixels
+from lightpage.calibration.goodness.ghost import ghost_amplitude
 from lightpage.calibration.goodness.light import PageLight
 from lightpage.calibration.goodness.measure import ShownPage, measure_goodness
+from lightpage.calibration.goodness.page_errors import outliers
 from lightpage.calibration.goodness.verdict import Goodness
 from lightpage.calibration.goodness.walls import WallDifference, wall_difference
 from lightpage.calibration.parameters import NAMES
@@ -33,15 +35,15 @@ STILL = ("drift.shift_px=0",)
 
 
 def fitted_page(
-    *settings: str, wrong_symbols: float = 0.0, stated: float = 1.0
+    *settings: str, wrong_symbols: float = 0.0, stated: float = 1.0, page: int = 0
 ) -> tuple[CalibratedDevice, LaunchConditions, FramePair, NDArray[np.complex128]]:
     """Return a calibration that knows all of a device but what it has no parameter for, and a page as it is known.
 
-    The profile states `stated` times the pipe's length.
+    The profile states `stated` times the pipe's length. Pages of other numbers have other symbols.
     """
     device = Device().with_settings([*STILL, *settings])
     simulator = Simulator(PROFILE, device, seed=3)
-    rng = np.random.default_rng(3)
+    rng = np.random.default_rng([3, page] if page else 3)
     symbols = rng.integers(256, size=PROFILE.page_shape).astype(np.uint8)
     pair, references = simulator.page(symbols), simulator.references()
     replaced = rng.random(symbols.shape) < wrong_symbols
@@ -194,6 +196,29 @@ def test_a_fault_of_the_bench_is_the_largest_cause(setting: str, name: str) -> N
     assert found.causes[0].remedy
 
 
+def test_dead_pixels_of_the_modulator_are_named_and_spoil_no_other_estimate() -> None:
+    shown = [ShownPage(*fitted_page("slm.dead_pixel_share=0.002", page=page)) for page in range(2)]
+    found = measure_goodness(TWIN, shown, explained_from=0.0)
+    assert [cause.name for cause in found.causes][:1] == ["dead modulator pixels"]
+    assert found.bits_lost < 0.1
+    assert found.modulator_noise_rad == pytest.approx(goodness_of().modulator_noise_rad, rel=0.1)
+
+
+def test_outliers_are_symbols_that_are_wrong_on_every_page_by_either_camera() -> None:
+    rng = np.random.default_rng(0)
+    shape = (2, 2, 50, 80)
+    noise = rng.standard_normal(shape) * 0.005 + 1j * rng.standard_normal(shape) * 0.02
+    assert not outliers([*noise]).any()
+    pages = noise.copy()
+    pages[..., 3, 4] -= 0.06  # dark: the amplitude stands out, the magnitude does not
+    pages[1, :, 5, 6] += 0.5  # wrong on one page alone
+    pages[:, 1, 7, 8] -= 0.5  # dust on one camera
+    pages *= np.linspace(1, 10, shape[-1])  # one side is explained worse
+    assert [*zip(*np.nonzero(outliers([*pages])), strict=True)] == [(3, 4)]
+    assert not outliers([pages[0]]).any()
+    assert not outliers([*(noise + (rng.random(shape[2:]) < 0.2))]).any()  # symbols that were not written
+
+
 def test_dust_that_settled_after_the_references_is_found_where_it_is() -> None:
     camera, sensor = PROFILE.camera, Device().with_settings(["sensor.late_dust_specks=6"]).sensor
     found = measure_goodness(TWIN, [ShownPage(*fitted_page("sensor.late_dust_specks=6"))], explained_from=0.0)
@@ -213,6 +238,14 @@ def test_vibration_costs_the_contrast_and_what_the_model_lacks_by_it() -> None:
 
 def test_a_good_fit_has_no_causes() -> None:
     assert measure_goodness(TWIN, [ShownPage(*fitted_page())], explained_from=0.0).causes == ()
+
+
+@pytest.mark.parametrize("amplitude", [0.0, 0.02, 0.06])
+def test_the_amplitude_of_light_that_passes_three_times_is_right_within_its_deviations(amplitude: float) -> None:
+    device, conditions, pair, symbols = fitted_page(f"geometry.ghost_relative={amplitude}")
+    measured = ghost_amplitude(PageLight(TWIN, device, conditions, pair, symbols))
+    assert measured.relative == pytest.approx(amplitude, abs=max(0.1 * amplitude, 3 * measured.deviation)), measured
+    assert measured.deviation < 0.002
 
 
 @pytest.mark.long
