@@ -5,6 +5,8 @@ from typing import Any
 
 import pytest
 
+from lightpage.codec.code import Code
+from lightpage.runtime.model.bundle.bundle import Bundle, write_bundle
 from tests.system.notebooks import FOLDER, NAMES, executed, notebook
 
 MOST_BYTES = 300_000
@@ -17,10 +19,11 @@ os.environ["TRAINING"] = (
     "decode-a-recording": 'os.environ.update(PROFILE="{profile}", BUNDLE="{bundle}", PAGES="2")',
     "store-a-photograph": """
 os.environ.update(PROFILE="{profile}", BUNDLE="{bundle}", DEVICE="", DRIFT="--set geometry.pipe_angle_deg=-0.2")
-CODE = dict(levels=8, coded_bits=2, rate_per_mille=500, corrections=2)
 SIDE_PX, PAGES = 16, 4""",
 }
 """What stands in place of the cell of parameters."""
+CODE = Code(levels=8, coded_bits=2, rate_per_mille=500, corrections=2)
+"""Code of the small device's bundle."""
 LONG = "export"
 """Tag of cells that are left out: half a minute of CPU, for what others test."""
 
@@ -50,7 +53,10 @@ def test_it_runs_on_a_small_device_and_shows_what_is_kept(
 ) -> None:
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setenv("IPYTHONDIR", str(tmp_path / "ipython"))
-    parameters = SMALLER[name].format(profile=small_device[1], bundle=small_bundle)
+    bundle = Bundle.open(small_bundle)
+    coded = bundle.manifest.model_copy(update={"code": CODE.to_toml()})
+    path = write_bundle(tmp_path / "coded.zip", coded, bundle.files)
+    parameters = SMALLER[name].format(profile=small_device[1], bundle=path)
     book = executed(name, f"import os\n{parameters}", without=LONG)
     assert "image/jpeg" in set().union(*shown(book))
     assert shown(book) == shown(notebook(name))
