@@ -163,13 +163,13 @@ def _orthogonal_part(fitted: Real, column: Real) -> Real:
 def _suspects(light: PageLight) -> Iterator[tuple[str, list[Real]]]:
     """Yield each possible cause with the columns by which it would change the equations."""
     coarse = light.coarse
-    page = light.page
+    page = light.coarse_page
     leaving = coarse.to_exit(page)  # lenses and pipe are made before threads ask for them
     here = coarse.from_exit(leaving)
     across, up = places_on_facet(coarse)
     squares = radius2(coarse)
-    x = light.waves.x[None, :]
-    y = light.waves.y[:, None]
+    x = coarse.x[None, :]
+    y = coarse.y[:, None]
     one = np.array([1, 0])[:, None, None]
 
     def at_exit(*factors: Real) -> list[Complex]:
@@ -186,10 +186,10 @@ def _suspects(light: PageLight) -> Iterator[tuple[str, list[Real]]]:
         return [curved * place * chosen for place in coarse_places(light) for chosen in (one, 1 - one)]
 
     def by_geometry(name: str) -> list[Complex]:
-        return [light.changed(None, None, **{name: step}).to_cameras(page) - here for step in _STEPS]
+        return [light.changed(None, **{name: step}).to_cameras(page) - here for step in _STEPS]
 
     def mixed() -> list[Complex]:
-        pages = [factor * page * step**power for power, factor in ((1, 1j), (2, 1)) for step in light.steps]
+        pages = [factor * light.page * step**power for power, factor in ((1, 1j), (2, 1)) for step in light.steps]
         return [light.waves.to_cameras(each)[:, *light.every] for each in pages]
 
     suspects: dict[str, Callable[[], list[Complex]]] = {

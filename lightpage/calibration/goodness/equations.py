@@ -18,7 +18,8 @@ Real = NDArray[np.float64]
 
 def equations_of_fit(light: PageLight) -> Iterator[Real]:
     """Yield the change of the equations, flat, by a small change of each parameter that the twin knows."""
-    leaving = light.coarse.to_exit(light.page)
+    page = light.coarse_page
+    leaving = light.coarse.to_exit(page)
     fields = light.coarse.from_exit(leaving)
     places = np.stack(np.meshgrid(light.grid.x_m, light.grid.y_m), axis=-1)[light.every]
 
@@ -29,7 +30,7 @@ def equations_of_fit(light: PageLight) -> Iterator[Real]:
             at = rows_and_columns(light.twin.pixels(moved, places.reshape(-1, 2)).reshape(2, *places.shape))
             counts = interpolated(light.images, at) / (2 * light.references[:, *light.every])
             return light.equations(counts - light.counts[:, *light.every])
-        changed = light.coarse.moved(index, light.changed(moved), light.page, leaving, fields)
+        changed = light.coarse.moved(index, light.changed(moved), page, leaving, fields)
         return light.equations_of(changed - fields)
 
     yield from in_parallel(change_by, range(min(light.twin.known, len(PARAMETERS))))

@@ -35,7 +35,7 @@ class GhostAmplitude(NamedTuple):
 def changes_by_ghost(light: PageLight) -> list[NDArray[np.complexfloating]]:
     """Changes of both cameras' light on the coarse grid by light that passes three times, in phase and a quarter on."""
     length = light.waves.channel.geometry.pipe_length_m
-    passed = light.changed(pipe_length_m=_PASSES * length).to_cameras(light.page)
+    passed = light.changed(pipe_length_m=_PASSES * length).to_cameras(light.coarse_page)
     return [passed, 1j * passed]
 
 

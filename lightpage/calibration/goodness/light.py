@@ -170,11 +170,8 @@ class PageLight:
         """
         terms = len(self._terms)
         waves = self.waves
-        page = self.page
-        share = 2 if self._samples % 4 == 0 else 1
-        coarse = self.changed(samples=self._samples // share)
-        rows, columns = page.shape
-        page = page.reshape(rows // share, share, columns // share, share).mean(axis=(1, 3)) * share  # as bright
+        page = self.coarse_page
+        coarse = self.coarse
         lighting = illumination_terms(coarse.x, coarse.y)
         first = coarse.to_cameras(page * lighting[0])  # lenses are made before threads ask for them
         by_illumination = [first, *in_parallel(lambda term: coarse.to_cameras(page * term), lighting[1:])]
@@ -233,15 +230,27 @@ class PageLight:
 
     @cached_property
     def coarse(self) -> FittedWaves:
-        """The fitted waves on the coarse grid."""
+        """The fitted waves from the modulator at half of its rate to the coarse grid."""
         return self.changed()
 
-    def changed(self, parameters: Real | None = None, samples: int | None = None, **geometry: float) -> FittedWaves:
-        """Fitted waves on the coarse grid, with other parameters, samples of a symbol, or geometry."""
+    @property
+    def coarse_page(self) -> Complex:
+        """Light of the modulator at the rate of `coarse`, and as bright."""
+        rows, columns = self.page.shape
+        share = self._share
+        return np.asarray(self.page.reshape(rows // share, share, columns // share, share).mean(axis=(1, 3)) * share)
+
+    @property
+    def _share(self) -> int:
+        """Samples of the modulator along an axis that make one at the rate of `coarse`."""
+        return 2 if self._samples % 4 == 0 else 1
+
+    def changed(self, parameters: Real | None = None, **geometry: float) -> FittedWaves:
+        """Fitted waves like `coarse`, with other parameters or geometry."""
         parameters = self.device.parameters if parameters is None else parameters
         coarse: dict[str, Any] = {"filled": True, "stride": self.stride, "accuracy": _ACCURACY}
         coarse |= {"changed": geometry, "blur": self._blur, "like": vars(self).get("coarse")}
-        return FittedWaves(self.device.profile, parameters, samples or self._samples, **coarse)
+        return FittedWaves(self.device.profile, parameters, self._samples // self._share, **coarse)
 
     @property
     def count_residual(self) -> Real:
