@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from lightpage.calibration.calibrate import KnownPage
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.document import Calibration
+from lightpage.calibration.known_pages import without_blemishes
+from lightpage.calibration.likelihood.late_dust import late_dust
 from lightpage.calibration.likelihood.measure import estimator_table
 from lightpage.calibration.likelihood.table import PIXEL_GAINS, pilot_tensors
 from lightpage.calibration.sampling_table import APART, SamplingTable
@@ -116,8 +118,13 @@ def estimated_device(
     device = calibration.device(profile, blemishes.references)
     twin = RayTwin(profile)
     estimator = PhaseEstimator(profile, device.parameters).eval()
+    likelihood = TorchLikelihood(estimator)
+    if calibration.behind_late_dust:
+        late = late_dust(likelihood, TorchTwin(twin), device, pages, statistics)
+        pages = without_blemishes(pages, late)
+        blemishes = blemishes.joined(late)
     table = estimator_table(
-        TorchLikelihood(estimator),
+        likelihood,
         TorchTwin(twin),
         device,
         pages,

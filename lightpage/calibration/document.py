@@ -14,7 +14,7 @@ from pydantic import AfterValidator, Field, field_serializer
 from lightpage.calibration.calibrate import Registered
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.goodness.causes import unlike_profile, with_unread
-from lightpage.calibration.goodness.remedies import UNKNOWN, largest
+from lightpage.calibration.goodness.remedies import DUST, UNKNOWN, largest
 from lightpage.calibration.goodness.verdict import GOOD, GOOD_SHARE, NOT_JUDGED, USABLE, Goodness, Reading
 from lightpage.calibration.likelihood.statistics import Statistics
 from lightpage.calibration.parameters import KNOWN, NAMES, as_dict, as_vector
@@ -231,6 +231,11 @@ class Calibration(TomlTable):
     def reference_coherence(self) -> float:
         """The coherence that later fits are measured by: that of the calibration from nominal."""
         return self.coherence_after if self.coherence_at_first is None else self.coherence_at_first
+
+    @property
+    def behind_late_dust(self) -> bool:
+        """Return whether dust that the references do not show is among the causes of what is lost."""
+        return self.goodness is not None and any(cause.name == DUST for cause in self.goodness.causes)
 
     @property
     def fitted(self) -> frozenset[str]:

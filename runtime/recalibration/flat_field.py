@@ -5,7 +5,7 @@ What the fitted waves miss on a device is mostly the same on every page. Two pag
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -72,19 +72,14 @@ def flat_field_of(
     others = others[: min(MOST_PAGES - len(used), len(others) - unseen)] if len(others) > unseen else []
     if FLAT_FIELD not in graph.ports or not others:
         return FlatFieldPages({}, ())
-    noise = graph.value(NOISE).copy()
-    noise[-1] = UNIT_NOISE
-    plain = graph.with_table({FLAT_FIELD: np.zeros(mask.shape, np.float32), NOISE: noise})
     earlier = np.asarray(graph.value(FLAT_FIELD), np.float64)
     found: list[PhaseErrors] = []
     hashes: list[str] = []
     table: SamplingTable = {}
     own = 0
-    for number, (page, known) in enumerate(_known(recording, device, [*used, *others])):
-        progress(number / (len(used) + len(others)))
-        errors = _errors(plain, known, mask)
-        if abs(np.mean(np.exp(1j * errors.phases))) < _LEAST_READ:
-            continue
+    pages = [*used, *others]
+    for page, known, errors in errors_of_pages(graph, recording, device, pages, mask):
+        progress(pages.index(page) / len(pages))
         found.append(errors)
         own += page in used
         if page not in used:
@@ -96,24 +91,34 @@ def flat_field_of(
     return FlatFieldPages(table, tuple(hashes) if table else ())
 
 
-def _known(recording: Recording, device: CalibratedDevice, pages: list[int]) -> Iterator[tuple[int, KnownPhases]]:
-    """Yield the numbers of known pages with their phases; pages without light are left out."""
+def errors_of_pages(
+    graph: EstimatorGraph,
+    recording: Recording,
+    device: CalibratedDevice,
+    pages: Sequence[int],
+    mask: NDArray[np.bool_],
+) -> Iterator[tuple[int, KnownPhases, PhaseErrors]]:
+    """Yield the numbers of known pages, and their errors without a flat field, [1, ny, nx] each.
+
+    Pages without light, and pages that are not read, are left out. See `flat_field_of`.
+    """
+    noise = graph.value(NOISE).copy()
+    noise[-1] = UNIT_NOISE
+    plain = graph.with_table({FLAT_FIELD: np.zeros(mask.shape, np.float32), NOISE: noise})
     for number in pages:
         try:
             (page,) = known_pages(recording, device.profile, [number])
         except InvalidInputError:
             continue
         known = KnownPhases.of(page, device)
-        yield number, known._replace(pair=narrow(known.pair, recording.bit_depth))
-
-
-def _errors(graph: EstimatorGraph, known: KnownPhases, mask: NDArray[np.bool_]) -> PhaseErrors:
-    """Errors of a page's phases after all steps, [1, ny, nx], where the last row of the graph's noise is of unit."""
-    feeds = placed(graph, known.feeds(mask))
-    state = graph.first_estimate(feeds)
-    for number in range(1, graph.most_steps + 1):
-        state = graph.step(state, feeds, number)
-    return PhaseErrors.of([state["p"]], [known], mask)
+        known = known._replace(pair=narrow(known.pair, recording.bit_depth))
+        feeds = placed(plain, known.feeds(mask))
+        state = plain.first_estimate(feeds)
+        for step in range(1, plain.most_steps + 1):
+            state = plain.step(state, feeds, step)
+        errors = PhaseErrors.of([state["p"]], [known], mask)
+        if abs(np.mean(np.exp(1j * errors.phases))) >= _LEAST_READ:
+            yield number, known, errors
 
 
 def _table(
@@ -128,7 +133,7 @@ def _table(
         earlier: flat field of the calibration, radians [ny, nx].
         graph: graph of the device.
     """
-    errors = PhaseErrors(*(np.concatenate(part) for part in zip(*found, strict=True)))
+    errors = PhaseErrors.together(found)
     best = best_flat_field(errors, data, earlier, judges=slice(own, None))
     if np.array_equal(best.phases, earlier) or not best.phases.any():
         return {}

@@ -168,6 +168,11 @@ class PhaseErrors(NamedTuple):
             phases.append(np.asarray(wrapped(error - piston)))
         return cls(np.stack(phases), np.stack([np.hypot(*p).astype(np.float64) for p in answers]))
 
+    @classmethod
+    def together(cls, errors: Sequence[PhaseErrors]) -> PhaseErrors:
+        """Join errors of several pages."""
+        return cls(*(np.concatenate(part) for part in zip(*errors, strict=True)))
+
     def noise(self, flat_fields: Real, data: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Fit the noise of the data symbols, [2], where each page has a flat field, [K, ny, nx]."""
         return fitted_noise((self.phases - flat_fields)[:, data].ravel(), self.information[:, data].ravel())

@@ -43,6 +43,16 @@ _LEAST_SHADE = 0.1
 """Least share of the light that a shadow takes."""
 _SHADE_DEVIATIONS = 7.0
 """Standard deviations from which on a place is a shadow."""
+_REACH_PX = 6
+"""Distance from a shaded place to which its shadow is measured, pixels."""
+_SMOOTHINGS_PX = (0.5, 1.0, 1.5, _SPECK_PX)
+"""Standard deviations of filters with which a shadow may be measured; the first whose noise is low enough is taken."""
+_MOST_NOISE = 0.03
+"""Largest noise of a measured shadow, over the light."""
+_EDGE_SHADE = 0.03
+"""Share of the light that a shadow takes at its edge."""
+_LEAST_PASSED = 0.26
+"""Least share of the light that passes: gains are bytes, and one is stored as 64."""
 _JOINED_PX = 2
 """Half of the distance to which shaded pixels belong to one shadow."""
 _NAMED = 3
@@ -139,8 +149,8 @@ def contrast_bits(terms: list[CountTerms]) -> float:
     return float(np.log2(1 + excess)) / 2
 
 
-def shadows(frames: list[NDArray[np.integer]], expected: list[Image]) -> NDArray[np.bool_]:
-    """Find the pixels of one camera that get less light on all pages than the model expects, [H, W].
+def passed_light(frames: list[NDArray[np.integer]], expected: list[Image]) -> Image:
+    """Share of the light that passes dust before the pixels of one camera, 1 where there is none, [H, W].
 
     Args:
         frames: counts of pages, [H, W] each.
@@ -153,16 +163,35 @@ def shadows(frames: list[NDArray[np.integer]], expected: list[Image]) -> NDArray
         clean = np.where(known, light, 0)
         products += frame * clean
         squares += clean**2
-    passed = scipy.ndimage.gaussian_filter(products, _SPECK_PX)
-    squares = scipy.ndimage.gaussian_filter(squares, _SPECK_PX)
-    bright = known & (squares > 0.1 * np.median(squares[known])) if known.any() else known
+    ratio = _smooth_ratio(products, squares, _SPECK_PX)
+    smooth = scipy.ndimage.gaussian_filter(squares, _SPECK_PX)
+    bright = known & (smooth > 0.1 * np.median(smooth[known])) if known.any() else known
     if not bright.any():
-        return known
-    ratio = np.where(bright, passed / np.where(bright, squares, 1), 1)
-    usual = float(np.median(ratio[bright]))
-    spread = float(scipy.stats.median_abs_deviation(ratio[bright], scale="normal"))
+        return np.ones(known.shape, np.float32)
+    usual, spread = _usual(ratio[bright])
     dark = bright & (ratio < usual - max(_LEAST_SHADE, _SHADE_DEVIATIONS * spread))
-    return np.asarray(dark & (np.mean(dark) < _MOST_SHADE))
+    near = bright & (scipy.ndimage.distance_transform_edt(~dark) <= _REACH_PX)
+    if not (dark.any() and np.mean(dark) < _MOST_SHADE and (bright & ~near).any()):
+        return np.ones(known.shape, np.float32)
+    for smoothing in _SMOOTHINGS_PX:
+        ratio = _smooth_ratio(products, squares, smoothing)
+        usual, spread = _usual(ratio[bright & ~near])
+        if spread <= _MOST_NOISE:
+            break
+    shaded = near & (ratio < usual - _EDGE_SHADE)
+    return np.where(shaded, np.maximum(ratio / usual, _LEAST_PASSED), 1).astype(np.float32)
+
+
+def _smooth_ratio(products: Real, squares: Real, smoothing_px: float) -> Real:
+    """Ratio of two smoothed images, 1 where the second is dark."""
+    above = scipy.ndimage.gaussian_filter(products, smoothing_px)
+    below = scipy.ndimage.gaussian_filter(squares, smoothing_px)
+    return np.where(below > 0, above / np.where(below > 0, below, 1), 1)
+
+
+def _usual(values: Real) -> tuple[float, float]:
+    """Median of values, and their standard deviation, to which outliers do not count."""
+    return float(np.median(values)), float(scipy.stats.median_abs_deviation(values, scale="normal"))
 
 
 def named_shadows(dark: NDArray[np.bool_]) -> str:

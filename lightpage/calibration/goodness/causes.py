@@ -37,7 +37,7 @@ _CHANCE = 4.0
 """Least ratio of the power that a cause explains to the power of noise that its columns explain by chance."""
 _MOST_CAUSES = 6
 """Largest number of causes that are taken off."""
-USUALLY_READ = 0.97
+_USUALLY_READ = 0.97
 """Share of the light's information that a decoder reads of a usual device."""
 _LEAST_UNREAD = 0.05
 """Least information that a reading lacks beyond what causes cost, for it to have a cause, bits a symbol."""
@@ -70,7 +70,7 @@ def with_unread(causes: tuple[Cause, ...], reading: Reading, parameters: Real) -
         reading: reading of known pages.
         parameters: of the device, [P].
     """
-    expected = USUALLY_READ * reading.light_bits - sum(cause.bits for cause in causes)
+    expected = _USUALLY_READ * reading.light_bits - sum(cause.bits for cause in causes)
     unread = expected - reading.air_bits
     if unread < _LEAST_UNREAD:
         return causes

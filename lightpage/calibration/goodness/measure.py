@@ -10,7 +10,7 @@ errors of amplitude, beyond those of noise, are errors that a better model would
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +25,7 @@ from lightpage.calibration.goodness.camera_faults import (
     named_contrast,
     named_exposures,
     named_shadows,
-    shadows,
+    passed_light,
 )
 from lightpage.calibration.goodness.causes import shares_of, unlike_profile
 from lightpage.calibration.goodness.equations import equations_near, noise_equations
@@ -120,7 +120,6 @@ class _PageErrors(NamedTuple):
         gain: gain of each symbol, [ny, nx].
         visible: symbols whose light both cameras see, [ny, nx].
         errors: relative errors without their smooth part and without the page's edges.
-        by_camera: the same by either camera alone, [2, ny, nx].
         phases: phases of the levels, without the page's edges.
         neighbourhood: see `steps_to_neighbours`, without the page's edges.
     """
@@ -131,11 +130,15 @@ class _PageErrors(NamedTuple):
     gain: NDArray[np.floating]
     visible: NDArray[np.bool_]
     errors: Complex
-    by_camera: Complex
     phases: Real
     neighbourhood: Real
 
-    def without(self, outlying: NDArray[np.bool_]) -> _PageErrors:
+    def errors_by_camera(self) -> Complex:
+        """Errors of the symbols as either camera alone shows them, [2, ny, nx]."""
+        back = self.light.waves.back_to_exit
+        return np.stack([self.rough(back(seen)) for seen in self.light.residual_by_camera()])
+
+    def without(self, outlying: NDArray[np.bool_] | np.bool_) -> _PageErrors:
         """Return the page without errors of outlying symbols, [ny, nx], whose light is then as measured."""
         self.light.correct_symbols(self.on_modulator(np.where(outlying, self.errors, 0)))
         return self._replace(errors=np.where(outlying, 0, self.errors))
@@ -149,9 +152,76 @@ class _PageErrors(NamedTuple):
         return _rough(self.light.errors(leaving), self.gain, self.visible)
 
 
+class _Noise(NamedTuple):
+    """Noise of a page's frames, and of the modulator with 1 rad a sample.
+
+    Attributes:
+        frames, modulator: on the exit facet.
+        frame_errors, modulator_errors: errors of symbols by it, see `_PageErrors`.
+    """
+
+    frames: Complex
+    modulator: Complex
+    frame_errors: Complex
+    modulator_errors: Complex
+
+    @classmethod
+    def drawn(cls, page: _PageErrors) -> _Noise:
+        """Draw the noise of a page."""
+        frames = page.light.waves.back_to_exit(page.light.frame_noise())
+        modulator = page.light.waves.back_to_exit(page.light.modulator_noise())
+        return cls(frames, modulator, page.rough(frames), page.rough(modulator))
+
+
+class _Split(NamedTuple):
+    """Errors of a page's symbols, split into noise and what a better model would explain.
+
+    Attributes:
+        errors: errors without those of levels and neighbours, [ny, nx].
+        by_symbols: what levels and neighbours explain, by the name of the cause.
+        unexplained: phase variance that a better model would explain.
+        amount: variance of the modulator's phase noise, a sample.
+        noise: variance of amplitude and phase by noise, [2].
+    """
+
+    errors: Complex
+    by_symbols: dict[str, Explained]
+    unexplained: float
+    amount: float
+    noise: Real
+
+    @classmethod
+    def of(cls, page: _PageErrors, noise: _Noise) -> _Split:
+        """Split the errors of a page's symbols."""
+        by_neighbours = without_neighbours(page.errors, page.neighbourhood)
+        by_level = without_levels(by_neighbours.residual, page.phases)
+        # a better model would explain errors of amplitude and phase alike; noise of the modulator is mostly of phase
+        every = by_level.residual, noise.frame_errors, noise.modulator_errors
+        total, frames, modulator = (_powers(each) for each in every)
+        amplitude, phase = np.maximum(total - frames, 0)
+        leak = modulator[0] / modulator[1]
+        unexplained = max(0.0, float((amplitude - leak * phase) / (1 - leak)))
+        beyond = max(0.0, float(phase - unexplained))
+        amount = min(beyond / modulator[1], _MOST_MODULATOR_NOISE_RAD2)
+        unexplained += beyond - amount * modulator[1]
+        by_symbols = {LEVELS: by_level, NEIGHBOURS: by_neighbours}
+        return cls(by_level.residual, by_symbols, unexplained, amount, frames + amount * modulator)
+
+    @property
+    def by_symbols_variance(self) -> float:
+        """Phase variance that levels and neighbours explain."""
+        return sum(each.variance for each in self.by_symbols.values())
+
+    @property
+    def bits_lost(self) -> float:
+        """Estimate of the information that is lost to what a better model would explain, bits a symbol."""
+        wrong = self.unexplained + self.by_symbols_variance
+        return float(np.log2(1 + wrong / (self.noise[1] + _OWN_ERROR_RAD**2))) / 2
+
+
 def measure_goodness(
     twin: Twin,
-    pages: Sequence[ShownPage],
+    pages: Iterable[ShownPage],
     progress: Callable[[float], None] = lambda share: None,
     *,
     gains: NDArray[np.uint8] | None = None,
@@ -162,8 +232,8 @@ def measure_goodness(
 
     Args:
         twin: ray tracer of the nominal device.
-        pages: page that is measured, and others of the same device. They tell what changes from page to page, and what
-            stays.
+        pages: page that is measured, and others of the same device, which are asked for if causes are searched. They
+            tell what changes from page to page, and what stays.
         progress: called with the finished share of the work.
         gains: gains of the cameras' pixels, which are 0 where they have no signal, [2, H, W]; None if unknown.
         explained_from: loss, bits a symbol, from which on its causes are searched.
@@ -172,52 +242,37 @@ def measure_goodness(
     Raises:
         CalibrationError: the cameras see the light of no symbol.
     """
-    every = list(in_parallel(lambda page: _page_errors(twin, page, progress), pages))
-    outlying = outliers([page.by_camera for page in every])
-    wrong_symbols = np.where(outlying, every[0].errors, 0)
-    every = [page.without(outlying) for page in every]
-    page = every[0]
-    light = page.light
-    back = light.waves.back_to_exit
-    frame_noise = back(light.frame_noise())
-    modulator_noise = back(light.modulator_noise())
-    frame_errors = page.rough(frame_noise)
-    modulator_errors = page.rough(modulator_noise)
-    by_neighbours = without_neighbours(page.errors, page.neighbourhood)
-    by_level = without_levels(by_neighbours.residual, page.phases)
-    errors = by_level.residual
+    shown = iter(pages)
+    first = next(shown)
+    page = _page_errors(twin, first, progress)
+    noise = _Noise.drawn(page)
+    split = _Split.of(page, noise)
     progress(0.8)
-    # A better model would explain errors of amplitude and of phase alike; noise of the modulator is mostly of phase.
-    total, frames, modulator = (_powers(each) for each in (errors, frame_errors, modulator_errors))
-    amplitude, phase = np.maximum(total - frames, 0)
-    leak = modulator[0] / modulator[1]
-    unexplained = max(0.0, float((amplitude - leak * phase) / (1 - leak)))
-    beyond = max(0.0, float(phase - unexplained))
-    amount = min(beyond / modulator[1], _MOST_MODULATOR_NOISE_RAD2)
-    unexplained += beyond - amount * modulator[1]
-    noise = frames + amount * modulator
-    wrong = unexplained + by_level.variance + by_neighbours.variance
-    lost = float(np.log2(1 + wrong / (noise[1] + _OWN_ERROR_RAD**2))) / 2
-    drawn = frame_errors + np.sqrt(amount) * modulator_errors
-    other_profile = unlike_profile(pages[0].device.parameters)
-    by_symbols = {LEVELS: by_level, NEIGHBOURS: by_neighbours}
     causes: tuple[Cause, ...] = ()
-    if max(lost, outlier_bits(wrong_symbols, noise[1]), contrast_bits(page.terms)) >= explained_from:
-        causes = _causes(every, errors, wrong_symbols, by_symbols, unexplained, drawn, amount, gains, values=values)
+    if max(split.bits_lost, contrast_bits(page.terms)) >= explained_from:
+        every = [page, *in_parallel(lambda other: _page_errors(twin, other), list(shown))]
+        outlying = outliers([each.errors_by_camera() for each in every]) if len(every) > 1 else np.bool_(False)
+        wrong_symbols = np.where(outlying, page.errors, 0)
+        every = [each.without(outlying) for each in every]
+        split = _Split.of(every[0], noise)
+        drawn = noise.frame_errors + np.sqrt(split.amount) * noise.modulator_errors
+        causes = _causes(every, split, wrong_symbols, drawn, gains, values=values)
+    lost = split.bits_lost
     if lost >= GOOD and not causes:
         causes = (cause_of(UNKNOWN, lost),)
-    cause = other_profile or (largest(causes) if lost >= GOOD else "")
+    cause = unlike_profile(first.device.parameters) or (largest(causes) if lost >= GOOD else "")
+    modulator_variance = float(split.amount * np.mean(noise.modulator_errors.imag**2))
     return Goodness(
         verdict="good" if lost < GOOD and not cause else "usable" if lost < USABLE else "wrong",
         bits_lost=lost,
-        unexplained_relative=2 * unexplained + by_level.variance + by_neighbours.variance,
-        noise_relative=float(noise.sum()),
-        modulator_noise_rad=float(np.sqrt(amount)),
-        by_page=_map(errors, frame_errors, amount, modulator_errors),
-        by_facet=_map(page.residual, frame_noise, amount, modulator_noise),
+        unexplained_relative=2 * split.unexplained + split.by_symbols_variance,
+        noise_relative=float(split.noise.sum()),
+        modulator_noise_rad=float(np.sqrt(split.amount)),
+        by_page=_map(split.errors, noise.frame_errors, split.amount, noise.modulator_errors),
+        by_facet=_map(page.residual, noise.frames, split.amount, noise.modulator),
         cause=cause,
-        frame_error_rad=float(np.sqrt(frames[1])),
-        modulator_error_rad=float(np.sqrt(amount * modulator[1])),
+        frame_error_rad=float(np.sqrt(np.mean(noise.frame_errors.imag**2))),
+        modulator_error_rad=float(np.sqrt(modulator_variance)),
         causes=causes,
     )
 
@@ -241,22 +296,18 @@ def _page_errors(twin: Twin, page: ShownPage, progress: Callable[[float], None] 
     if not visible.any():
         raise CalibrationError("calibration, verdict", "no symbol whose light both cameras see", "some")
     errors = _rough(light.errors(residual), gain, visible)
-    by_camera = np.stack([_rough(light.errors(back(seen)), gain, visible) for seen in light.residual_by_camera()])
     phases = np.mod(np.angle(page.symbols), 2 * np.pi)
     inside = slice(_EDGE, -_EDGE), slice(_EDGE, -_EDGE)
     neighbourhood = steps_to_neighbours(phases)[:, *inside]
     progress(0.6)
-    return _PageErrors(light, terms, residual, gain, visible, errors, by_camera, phases[inside], neighbourhood)
+    return _PageErrors(light, terms, residual, gain, visible, errors, phases[inside], neighbourhood)
 
 
 def _causes(
     pages: Sequence[_PageErrors],
-    errors: Complex,
+    split: _Split,
     wrong_symbols: Complex,
-    by_symbols: dict[str, Explained],
-    unexplained: float,
     drawn: Complex,
-    amount: float,
     gains: NDArray[np.uint8] | None,
     *,
     values: bool,
@@ -264,16 +315,15 @@ def _causes(
     """Split what is lost among its causes, the largest first.
 
     Args:
-        pages: known pages.
-        errors: errors of the first one's symbols without those of outliers, levels and neighbours.
+        pages: known pages without the errors of outliers.
+        split: split of the first one's errors.
         wrong_symbols: errors of its outliers, zero elsewhere.
-        by_symbols: what levels and neighbours explain of them, by the name of the cause.
-        unexplained: phase variance that a better model would explain.
         drawn: errors as noise alone makes them. An estimator by the fitted waves adds no errors of its own.
-        amount: variance of the modulator's phase noise, a sample.
         gains: gains of the cameras' pixels, [2, H, W]; None if unknown.
         values: whether the sizes of causes are measured too.
     """
+    by_symbols = split.by_symbols
+    unexplained = split.unexplained
     page = pages[0]
     flicker = flicker_variance([each.errors for each in pages], [each.phases for each in pages])
     variance = max(float(np.mean(drawn.imag**2)), _TINY)
@@ -281,11 +331,11 @@ def _causes(
     variances |= {FLICKER: flicker, LEVELS: max(0.0, variances[LEVELS] - flicker)}
     light = page.light
     known = page.on_modulator(by_symbols[LEVELS].part + by_symbols[NEIGHBOURS].part)
-    dark = np.stack([shadows(*_frames_of(pages, camera)) for camera in range(2)])
+    dark = np.stack([passed_light(*_frames_of(pages, camera)) < 1 for camera in range(2)])
     places = {DUST: equations_near(light, dark)}
     if gains is not None:
         places[CAMERA_PIXELS] = equations_near(light, gains == 0)
-    noise = noise_equations(light, amount)
+    noise = noise_equations(light, split.amount)
     shares = shares_of(light, noise, known, places)
     contrast = named_contrast(page.terms)
     for name, share in shares.items():
@@ -297,7 +347,7 @@ def _causes(
     if contrast == VIBRATION:
         bits[VIBRATION] = bits.get(VIBRATION, 0.0) + contrast_bits(page.terms)
     unknown = lost * max(0.0, 1 - sum(variances.values()) / max(wrong, _TINY))
-    foreign = np.mean(np.abs(errors) ** 2) > _FOREIGN
+    foreign = np.mean(np.abs(split.errors) ** 2) > _FOREIGN
     bits[OTHER_SYMBOLS if foreign else UNKNOWN] = unknown
     details = {
         DEAD_PIXELS: named_outliers(wrong_symbols != 0),

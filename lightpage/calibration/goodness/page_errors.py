@@ -132,14 +132,14 @@ def outliers(errors: Sequence[Complex]) -> NDArray[np.bool_]:
         errors: relative errors of each page's symbols by either camera, [2, ny, nx].
 
     Returns:
-        Where they are, bool [ny, nx]; nowhere with one page, which shows as well what was not written.
+        Where they are, bool [ny, nx].
     """
     parts = np.array([part for page in errors for camera in page for part in (camera.real, camera.imag)])
     usual = [scipy.ndimage.median_filter(np.abs(part), _AROUND) * _OF_MEDIAN for part in parts]
     by_view = np.sum(((parts / np.maximum(usual, _TINY)) ** 2).reshape(-1, 2, *parts.shape[1:]), axis=1)
     most = scipy.stats.chi2.isf(_BY_CHANCE, len(parts))
     where = (by_view.sum(axis=0) > most) & (by_view.min(axis=0) > _ON_EACH)
-    return np.asarray(where & (len(errors) > 1) & (np.mean(where) < _MOST_DEAD))
+    return np.asarray(where & (np.mean(where) < _MOST_DEAD))
 
 
 def outlier_bits(errors: Complex, noise: float) -> float:

@@ -7,7 +7,7 @@ of its own.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -175,30 +175,28 @@ class DeviceFit:
             statistics = moved_statistics
             if solution.gain < _LEAST_GAIN * len(solution.step):
                 break
-        goodness = self._goodness(current, conditions, [*fit.pages, *self._fitted(fit, current, statistics)])
+        goodness = self._goodness(current, conditions, fit, statistics)
         self._progress(1.0)
         at_mean = _at_page(current.parameters, np.mean([page.nuisance for page in fit.pages], axis=0))
         parameters = np.where(registered.deviations > 0, at_mean, current.parameters)
         return replace(current, parameters=parameters, goodness=goodness), statistics
 
-    def _fitted(self, fit: KnownPageFit, registered: Registered, statistics: Statistics) -> list[FittedPage]:
-        """Fit the nuisance parameters of pages that are judged and were not scored."""
-        rest = KnownPageFit(self._likelihood, fit.table, self._pages[len(fit.pages) : _JUDGED], registered.modulation)
-        rest.fit_gains(statistics)
-        for page in rest.pages:
-            rest.fit_nuisance(page)
-        return rest.pages
-
-    def _goodness(self, registered: Registered, conditions: LaunchConditions, pages: Sequence[FittedPage]) -> Goodness:
+    def _goodness(
+        self, registered: Registered, conditions: LaunchConditions, fit: KnownPageFit, statistics: Statistics
+    ) -> Goodness:
         """Judge a registration by the light of its first page; the next one tells causes that stay, and that change."""
-        illumination = conditions.illumination
-        phase = abs(illumination[0]) / illumination[0]
-        shown = []
-        for page, known in zip(pages[:_JUDGED], self._pages, strict=False):
-            moved = replace(registered, parameters=_at_page(registered.parameters, page.nuisance))
-            launched = conditions._replace(illumination=illumination * (page.gain * phase))
-            shown.append(ShownPage(self._device(moved), launched, known.pair, known.symbols))
-        return measure_goodness(self._twin, shown, gains=self._gains, explained_from=_EXPLAINED_FROM, values=True)
+        device = self._device(registered)
+
+        def shown() -> Iterator[ShownPage]:
+            yield from shown_pages(device, conditions, fit.pages[:_JUDGED], self._pages)
+            known = self._pages[len(fit.pages) : _JUDGED]
+            rest = KnownPageFit(self._likelihood, fit.table, known, registered.modulation)
+            rest.fit_gains(statistics)
+            for page in rest.pages:
+                rest.fit_nuisance(page)
+            yield from shown_pages(device, conditions, rest.pages, known)
+
+        return measure_goodness(self._twin, shown(), gains=self._gains, explained_from=_EXPLAINED_FROM, values=True)
 
     def _device(self, registered: Registered) -> CalibratedDevice:
         return CalibratedDevice(
@@ -362,6 +360,27 @@ class DeviceFit:
             # the inverse of an orientation is its transpose
             derivatives.append(np.einsum("acn,cni,cia->cn", by_shift, displacement, to_image))
         return derivatives
+
+
+def shown_pages(
+    device: CalibratedDevice, conditions: LaunchConditions, fitted: Sequence[FittedPage], pages: Sequence[KnownPage]
+) -> list[ShownPage]:
+    """Return known pages as the device shows each, with the page's own tilt, shift and gain.
+
+    Args:
+        device: calibrated device.
+        conditions: illumination and blur of its pages.
+        fitted: the first of the pages with their nuisance parameters.
+        pages: known pages.
+    """
+    illumination = conditions.illumination
+    phase = abs(illumination[0]) / illumination[0]
+    shown = []
+    for page, known in zip(fitted, pages, strict=False):
+        moved = replace(device, parameters=_at_page(device.parameters, page.nuisance))
+        launched = conditions._replace(illumination=illumination * (page.gain * phase))
+        shown.append(ShownPage(moved, launched, known.pair, known.symbols))
+    return shown
 
 
 def _at_page(parameters: Real, nuisance: Real) -> Real:

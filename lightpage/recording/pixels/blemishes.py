@@ -7,7 +7,7 @@ is as often bright as dark, and is left as it is.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -108,6 +108,16 @@ class Blemishes:
         frames = references.in_phase, references.quadrature
         gains, corrected = zip(*map(_camera_blemishes, frames), strict=True)
         return cls(np.stack(gains), FramePair(*corrected))
+
+    @classmethod
+    def behind(cls, passed: Image, references: FramePair) -> Self:
+        """Blemishes of cameras behind dust, of whose light a share passes, [2, H, W]; clean references."""
+        return cls(np.minimum(np.rint(UNIT_GAIN / passed), np.iinfo(np.uint8).max).astype(np.uint8), references)
+
+    def joined(self, other: Self) -> Self:
+        """Return these blemishes with others beside them that the references do not show."""
+        gains = self.gains.astype(np.float32) * other.gains / UNIT_GAIN
+        return replace(self, gains=np.minimum(np.rint(gains), np.iinfo(np.uint8).max).astype(np.uint8))
 
     @property
     def unit_gains(self) -> NDArray[np.uint8]:

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from lightpage.calibration.document import Calibration
+from lightpage.calibration.known_pages import without_blemishes
+from lightpage.calibration.likelihood.late_dust import late_dust
 from lightpage.calibration.likelihood.table import FLAT_FIELD, PIXEL_GAINS, pilot_tensors
 from lightpage.codec.code import parse_code
 from lightpage.device.profile import Profile
@@ -132,8 +134,13 @@ def bundle_by_graphs(
     graph = neutral_graph(decoder, blemishes)
     mask = decoder.bundle.pilot_mask
     twin = OnnxTwin(decoder.bundle)
+    likelihood = GraphLikelihood(graph)
+    if calibration.behind_late_dust:
+        late = late_dust(likelihood, twin, device, known, statistics)
+        known = without_blemishes(known, late)
+        blemishes = blemishes.joined(late)
     measured = measured_table(
-        GraphLikelihood(graph), twin, device, known, statistics, mask, lambda share: progress("noise", 0.6 * share)
+        likelihood, twin, device, known, statistics, mask, lambda share: progress("noise", 0.6 * share)
     )
     result = traced(decoder, twin, blemishes.references, calibration, gains=blemishes.gains)
     result = replace(result, table={**result.table, **measured})

@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lightpage.calibration.calibrated_device import CalibratedDevice
+from lightpage.calibration.goodness.camera_faults import passed_light
 from lightpage.calibration.goodness.frame_noise import noise_curve, noise_like, on_pixels
 from lightpage.calibration.goodness.ghost import ghost_amplitude
 from lightpage.calibration.goodness.light import PageLight
@@ -215,7 +216,6 @@ def test_outliers_are_symbols_that_are_wrong_on_every_page_by_either_camera() ->
     pages[:, 1, 7, 8] -= 0.5  # dust on one camera
     pages *= np.linspace(1, 10, shape[-1])  # one side is explained worse
     assert [*zip(*np.nonzero(outliers([*pages])), strict=True)] == [(3, 4)]
-    assert not outliers([pages[0]]).any()
     assert not outliers([*(noise + (rng.random(shape[2:]) < 0.2))]).any()  # symbols that were not written
 
 
@@ -228,6 +228,18 @@ def test_dust_that_settled_after_the_references_is_found_where_it_is() -> None:
     column, row = map(int, named.groups())
     passed = Blemishes.of(camera, sensor, 1).late_transmission
     assert np.min(np.asarray(passed)[row - 2 : row + 3, column - 2 : column + 3]) < 0.8
+
+
+def test_the_light_that_passes_dust_is_measured_at_each_pixel() -> None:
+    rng = np.random.default_rng(0)
+    rows, columns = np.mgrid[:120, :160]
+    speck = 1 - 0.6 * np.exp(-((rows - 50) ** 2 + (columns - 70) ** 2) / (2 * 3.0**2))
+    expected = [np.float32(1000 * rng.gamma(2, size=rows.shape)) for _ in range(2)]
+    frames = [rng.poisson(speck * each) for each in expected]
+    passed = passed_light(frames, expected)
+    assert (passed[:40] == 1).all()
+    np.testing.assert_allclose(passed[44:57, 64:77], speck[44:57, 64:77], atol=0.1)
+    assert (passed_light([rng.poisson(each) for each in expected], expected) == 1).all()
 
 
 def test_vibration_costs_the_contrast_and_what_the_model_lacks_by_it() -> None:
