@@ -8,11 +8,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from lightpage.calibration.calibrate import KnownPage
 from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.document import Calibration
-from lightpage.calibration.known_pages import without_blemishes
-from lightpage.calibration.likelihood.late_dust import late_dust
 from lightpage.calibration.likelihood.measure import estimator_table
 from lightpage.calibration.likelihood.table import PIXEL_GAINS, pilot_tensors
 from lightpage.calibration.sampling_table import APART, SamplingTable
@@ -23,7 +20,6 @@ from lightpage.page.correction import wrapped
 from lightpage.page.pilots import Pilots
 from lightpage.page.symbols import pilot_mask
 from lightpage.progress import Progress
-from lightpage.recording.frame_pair import FramePair
 from lightpage.recording.reader import Recording
 from lightpage.runtime.archives.recordings.new_bundle import calibrated_pages
 from lightpage.runtime.model.execution.estimator_graph import (
@@ -36,7 +32,7 @@ from lightpage.runtime.model.execution.estimator_graph import (
 from lightpage.runtime.model.execution.table_graph import HeldTable
 from lightpage.runtime.recalibration.estimator import check_counts
 from lightpage.runtime.recalibration.flat_field import flat_field_of
-from lightpage.runtime.recalibration.from_nominal import recorded_pages
+from lightpage.runtime.recalibration.from_nominal import RecordedPages, recorded_pages, without_late_dust
 from lightpage.runtime.recalibration.noise import MOST_STEPS, KnownPhases, deviation_prior_scale, measured_noise
 from lightpage.train.models.likelihood.estimator import Estimate, PhaseEstimator
 from lightpage.train.models.likelihood.torch_likelihood import TorchLikelihood
@@ -59,8 +55,7 @@ class EstimatedDevice:
         graphs: the estimator's graphs.
         table: every tensor that the graphs take.
         optional: names of those that only some devices have.
-        pages: known pages without blemishes, with frames in the type that the bundle takes.
-        last_pair: frames of the last of them with their blemishes.
+        pages: known pages, with frames in the type that the bundle takes.
         pilot_mask: positions of the pilots, bool [ny, nx].
         pilot_phases: phases of the device's own fixed pilots, radians, 1-D; None if they are the profile's.
         flat_field_pages: hashes of further pages that the flat field is made of, see `hash_frames`.
@@ -72,8 +67,7 @@ class EstimatedDevice:
     graphs: EstimatorFiles
     table: SamplingTable
     optional: tuple[str, ...]
-    pages: list[KnownPage]
-    last_pair: FramePair
+    pages: RecordedPages
     pilot_mask: NDArray[np.bool_]
     pilot_phases: NDArray[np.float32] | None
     flat_field_pages: tuple[str, ...]
@@ -86,7 +80,7 @@ class EstimatedDevice:
     @property
     def frame_dtype(self) -> str:
         """Numpy type of a frame's counts."""
-        return self.pages[0].pair.in_phase.dtype.name
+        return self.pages.last_pair.in_phase.dtype.name
 
 
 def estimated_device(
@@ -114,15 +108,14 @@ def estimated_device(
     if (statistics := calibration.statistics) is None:
         raise CalibrationError("calibration: statistics", "none", "statistics of the counts: calibrate anew")
     used = calibrated_pages(calibration, recording)
-    blemishes, pages, last_pair = recorded_pages(recording, profile, used)
-    device = calibration.device(profile, blemishes.references)
+    recorded = recorded_pages(recording, profile, used)
+    device = calibration.device(profile, recorded.blemishes.references)
     twin = RayTwin(profile)
     estimator = PhaseEstimator(profile, device.parameters).eval()
     likelihood = TorchLikelihood(estimator)
-    if calibration.behind_late_dust:
-        late = late_dust(likelihood, TorchTwin(twin), device, pages, statistics)
-        pages = without_blemishes(pages, late)
-        blemishes = blemishes.joined(late)
+    recorded = without_late_dust(recorded, likelihood, TorchTwin(twin), device, calibration)
+    pages = recorded.corrected
+    blemishes = recorded.blemishes
     table = estimator_table(
         likelihood,
         TorchTwin(twin),
@@ -151,7 +144,7 @@ def estimated_device(
     graph = EstimatorGraph(graphs, HeldTable(table), "estimator", None)  # of as many steps as pay
     flat = flat_field_of(graph, recording, device, used, mask, lambda share: progress("flat field", share))
     table |= flat.table
-    return EstimatedDevice(device, twin, estimator, graphs, table, optional, pages, last_pair, mask, own, flat.hashes)
+    return EstimatedDevice(device, twin, estimator, graphs, table, optional, recorded, mask, own, flat.hashes)
 
 
 def coarse_start_pays(

@@ -76,7 +76,7 @@ def export_calibration(
     progress("ask torch", 0.7)
     whole = WholeGraph(estimated.estimator, estimated.optional, estimated.steps).eval()
     defaults = {name: np.asarray(table[name]) for name in whole.table_inputs}
-    limit, pair, expected = golden_of(whole, estimated.last_pair, defaults, bits, CHI_SQUARE)
+    limit, pair, expected = golden_of(whole, estimated.pages.last_pair, defaults, bits, CHI_SQUARE)
     decoder = whole_onnx(estimated.graphs, estimated.steps, table)
     progress("ask ONNX Runtime", 0.8)
     once = open_session(decoder, f"{out}: {DECODER}", once=True)

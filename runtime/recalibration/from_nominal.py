@@ -8,9 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 from lightpage.calibration.calibrate import KnownPage, Registered, calibrate
+from lightpage.calibration.calibrated_device import CalibratedDevice
 from lightpage.calibration.document import BlemishCounts, Calibration
+from lightpage.calibration.interfaces import Twin
 from lightpage.calibration.known_pages import known_pages, without_blemishes
 from lightpage.calibration.likelihood.device_fit import AFTER_REGISTRATION, DeviceFit
+from lightpage.calibration.likelihood.interfaces import PageLikelihood
+from lightpage.calibration.likelihood.late_dust import late_dust
 from lightpage.calibration.likelihood.table import FLAT_FIELD, PIXEL_GAINS
 from lightpage.calibration.sampling_table import apart_inputs
 from lightpage.device.profile import Profile
@@ -107,6 +111,24 @@ def recorded_pages(recording: Recording, profile: Profile, pages: Sequence[int])
     blemishes = Blemishes.of(narrow(recording.references(), bits))
     read = [KnownPage(narrow(page.pair, bits), page.symbols) for page in known_pages(recording, profile, pages)]
     return RecordedPages(blemishes, without_blemishes(read, blemishes), read[-1].pair)
+
+
+def without_late_dust(
+    pages: RecordedPages, likelihood: PageLikelihood, twin: Twin, device: CalibratedDevice, calibration: Calibration
+) -> RecordedPages:
+    """Return known pages without the shadows of dust that the references do not show, if the calibration names such.
+
+    Args:
+        pages: known pages.
+        likelihood: likelihood of the device's pages.
+        twin: ray tracer of the nominal device.
+        device: calibrated device.
+        calibration: its calibration.
+    """
+    if calibration.statistics is None or not calibration.behind_late_dust:
+        return pages
+    late = late_dust(likelihood, twin, device, pages.corrected, calibration.statistics)
+    return pages._replace(blemishes=pages.blemishes.joined(late), corrected=without_blemishes(pages.corrected, late))
 
 
 def neutral_graph(decoder: Decoder, blemishes: Blemishes) -> EstimatorGraph:

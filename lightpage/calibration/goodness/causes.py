@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from lightpage.calibration.goodness.equations import coarse_places, equations_of_contrast, equations_of_fit
 from lightpage.calibration.goodness.ghost import changes_by_ghost
-from lightpage.calibration.goodness.light import PageLight, places_on_facet, radius2
+from lightpage.calibration.goodness.light import PageLight, coarse_page, places_on_facet, radius2
 from lightpage.calibration.goodness.remedies import CAMERA_TILT, CONTRAST, GHOST, NEIGHBOURS, UNKNOWN, WALLS, cause_of
 from lightpage.calibration.goodness.verdict import Cause, Reading
 from lightpage.calibration.parameters import NAMES, PRIORS, as_dict, indices
@@ -163,7 +163,7 @@ def _orthogonal_part(fitted: Real, column: Real) -> Real:
 def _suspects(light: PageLight) -> Iterator[tuple[str, list[Real]]]:
     """Yield each possible cause with the columns by which it would change the equations."""
     coarse = light.coarse
-    page = light.coarse_page
+    page = coarse_page(light)
     leaving = coarse.to_exit(page)  # lenses and pipe are made before threads ask for them
     here = coarse.from_exit(leaving)
     across, up = places_on_facet(coarse)

@@ -9,7 +9,7 @@ import scipy
 from numpy.typing import NDArray
 
 from lightpage.calibration.goodness.frame_noise import CountCurve
-from lightpage.calibration.goodness.light import PageLight, interpolated, rows_and_columns
+from lightpage.calibration.goodness.light import PageLight, coarse_page, interpolated, rows_and_columns
 from lightpage.calibration.parameters import PARAMETERS, SEEN_BY_CAMERAS, STEPS
 from lightpage.waves.parallel import in_parallel
 
@@ -18,7 +18,7 @@ Real = NDArray[np.float64]
 
 def equations_of_fit(light: PageLight) -> Iterator[Real]:
     """Yield the change of the equations, flat, by a small change of each parameter that the twin knows."""
-    page = light.coarse_page
+    page = coarse_page(light)
     leaving = light.coarse.to_exit(page)
     fields = light.coarse.from_exit(leaving)
     places = np.stack(np.meshgrid(light.grid.x_m, light.grid.y_m), axis=-1)[light.every]

@@ -9,7 +9,7 @@ import scipy
 from numpy.typing import NDArray
 
 from lightpage.calibration.goodness.equations import equations_of_fit
-from lightpage.calibration.goodness.light import PageLight
+from lightpage.calibration.goodness.light import PageLight, coarse_page
 
 _RANK = 1e-4
 """Singular values are dropped below this share of the largest."""
@@ -35,7 +35,7 @@ class GhostAmplitude(NamedTuple):
 def changes_by_ghost(light: PageLight) -> list[NDArray[np.complexfloating]]:
     """Changes of both cameras' light on the coarse grid by light that passes three times, in phase and a quarter on."""
     length = light.waves.channel.geometry.pipe_length_m
-    passed = light.changed(pipe_length_m=_PASSES * length).to_cameras(light.coarse_page)
+    passed = light.changed(pipe_length_m=_PASSES * length).to_cameras(coarse_page(light))
     return [passed, 1j * passed]
 
 

@@ -76,6 +76,7 @@ class PageLight:
         self.pair = pair
         self.symbols = symbols
         self._samples = symbol_samples(profile)
+        self._coarse_samples = self._samples // 2 if self._samples % 4 == 0 else self._samples
         self.grid = field_grid(profile)
         self.stride = max(_LEAST_STRIDE, int(np.sqrt(np.prod(self.grid.shape) / _EQUATIONS)))
         self.every = (slice(None, None, self.stride), slice(None, None, self.stride))
@@ -114,11 +115,6 @@ class PageLight:
     def residual(self) -> Complex:
         """Residual of the model, as light of both cameras that would explain it, complex [2, Gy, Gx]."""
         return self._explaining_light(self.count_residual)
-
-    def residual_by_camera(self) -> list[Complex]:
-        """Residual as light that would explain one camera's alone, twice as bright, complex [2, Gy, Gx] each."""
-        residual = self.residual
-        return [residual * chosen for chosen in 2 * np.eye(2)[:, :, None, None]]
 
     def observed_change(self, change: Complex) -> Complex:
         """Estimate a small change of both cameras' light from their equations, which miss its other quadrature."""
@@ -170,7 +166,7 @@ class PageLight:
         """
         terms = len(self._terms)
         waves = self.waves
-        page = self.coarse_page
+        page = coarse_page(self)
         coarse = self.coarse
         lighting = illumination_terms(coarse.x, coarse.y)
         first = coarse.to_cameras(page * lighting[0])  # lenses are made before threads ask for them
@@ -196,11 +192,6 @@ class PageLight:
             counts = level * (1 + 2 * self.counts[camera])
             excess = CountCurve.measured(expected[self.visible], (counts - expected)[self.visible])
             self._excess[camera] = excess.at(expected) / (2 * level)
-
-    def correct_symbols(self, errors: Complex) -> None:
-        """Correct the model by relative errors of the modulator's samples, [ny samples, nx samples]."""
-        if errors.any():
-            self.fields = self.fields + self.waves.to_cameras(errors * self.page)
 
     def equations(self, residual: Real) -> Real:
         """Weigh equations [2, Gy, Gx], or those of the coarse grid, by their noise; on the coarse grid, flat."""
@@ -233,24 +224,12 @@ class PageLight:
         """The fitted waves from the modulator at half of its rate to the coarse grid."""
         return self.changed()
 
-    @property
-    def coarse_page(self) -> Complex:
-        """Light of the modulator at the rate of `coarse`, and as bright."""
-        rows, columns = self.page.shape
-        share = self._share
-        return np.asarray(self.page.reshape(rows // share, share, columns // share, share).mean(axis=(1, 3)) * share)
-
-    @property
-    def _share(self) -> int:
-        """Samples of the modulator along an axis that make one at the rate of `coarse`."""
-        return 2 if self._samples % 4 == 0 else 1
-
     def changed(self, parameters: Real | None = None, **geometry: float) -> FittedWaves:
         """Fitted waves like `coarse`, with other parameters or geometry."""
         parameters = self.device.parameters if parameters is None else parameters
         coarse: dict[str, Any] = {"filled": True, "stride": self.stride, "accuracy": _ACCURACY}
         coarse |= {"changed": geometry, "blur": self._blur, "like": vars(self).get("coarse")}
-        return FittedWaves(self.device.profile, parameters, self._samples // self._share, **coarse)
+        return FittedWaves(self.device.profile, parameters, self._coarse_samples, **coarse)
 
     @property
     def count_residual(self) -> Real:
@@ -266,6 +245,13 @@ class PageLight:
         """Light of both cameras that explains residuals of their equations [2, Gy, Gx], weighted by their noise."""
         gradient = self._count_gradient()
         return np.asarray(self.visible * self.amplitude * gradient * residual / (np.abs(gradient) ** 2 + READ_NOISE))
+
+
+def coarse_page(light: PageLight) -> Complex:
+    """Light of the modulator at the rate of the coarse waves, and as bright, complex [ny samples, nx samples]."""
+    rows, columns = light.page.shape
+    share = rows // len(light.coarse.y)
+    return np.asarray(light.page.reshape(rows // share, share, columns // share, share).mean(axis=(1, 3)) * share)
 
 
 def places_on_facet(waves: FittedWaves) -> tuple[Real, Real]:

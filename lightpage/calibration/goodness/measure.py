@@ -135,12 +135,16 @@ class _PageErrors(NamedTuple):
 
     def errors_by_camera(self) -> Complex:
         """Errors of the symbols as either camera alone shows them, [2, ny, nx]."""
-        back = self.light.waves.back_to_exit
-        return np.stack([self.rough(back(seen)) for seen in self.light.residual_by_camera()])
+        residual = 2 * self.light.residual  # one camera's light is half of it
+        by_camera = [residual * chosen for chosen in np.eye(2)[:, :, None, None]]
+        return np.stack([self.rough(self.light.waves.back_to_exit(each)) for each in by_camera])
 
     def without(self, outlying: NDArray[np.bool_] | np.bool_) -> _PageErrors:
         """Return the page without errors of outlying symbols, [ny, nx], whose light is then as measured."""
-        self.light.correct_symbols(self.on_modulator(np.where(outlying, self.errors, 0)))
+        light = self.light
+        if outlying.any():
+            wrong = self.on_modulator(np.where(outlying, self.errors, 0))
+            light.fields = light.fields + light.waves.to_cameras(wrong * light.page)
         return self._replace(errors=np.where(outlying, 0, self.errors))
 
     def on_modulator(self, errors: Complex) -> Complex:

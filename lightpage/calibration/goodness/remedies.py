@@ -70,7 +70,8 @@ REMEDIES = {
     BEND: Remedy("cameras that are not linear", "switch off gamma and gain control, or expose less"),
     CAMERA_PIXELS: Remedy("hot or dead pixels of a camera, few places", "cool or replace the camera"),
     DUST: Remedy(
-        "dust on a camera that its reference does not show, few places", "clean the camera and record new references"
+        "dust on a camera that its reference does not show, few places; a bundle divides its shadows out of pages",
+        "clean the camera and record new references",
     ),
     LEVELS: Remedy(
         "levels whose phases follow no smooth curve", "load the modulator's lookup table for this wavelength"

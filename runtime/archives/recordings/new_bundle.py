@@ -9,8 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from lightpage.calibration.document import Calibration
-from lightpage.calibration.known_pages import without_blemishes
-from lightpage.calibration.likelihood.late_dust import late_dust
 from lightpage.calibration.likelihood.table import FLAT_FIELD, PIXEL_GAINS, pilot_tensors
 from lightpage.codec.code import parse_code
 from lightpage.device.profile import Profile
@@ -31,7 +29,7 @@ from lightpage.runtime.model.execution.estimator_graph import EstimatorGraph
 from lightpage.runtime.model.execution.twin import OnnxTwin
 from lightpage.runtime.recalibration.estimator import GraphLikelihood, check_counts, measured_table
 from lightpage.runtime.recalibration.flat_field import flat_field_of
-from lightpage.runtime.recalibration.from_nominal import neutral_graph, recorded_pages
+from lightpage.runtime.recalibration.from_nominal import neutral_graph, recorded_pages, without_late_dust
 from lightpage.runtime.recalibration.noise import KnownPhases
 from lightpage.runtime.recalibration.recalibration import golden_page, refitted_bundle
 from lightpage.runtime.recalibration.refit import traced
@@ -129,16 +127,13 @@ def bundle_by_graphs(
     if (statistics := calibration.statistics) is None:
         raise CalibrationError("calibration: statistics", "none", "statistics of the counts: calibrate anew")
     used = calibrated_pages(calibration, recording)
-    blemishes, known, pair = recorded_pages(recording, profile, used)
-    device = calibration.device(profile, blemishes.references)
-    graph = neutral_graph(decoder, blemishes)
+    pages = recorded_pages(recording, profile, used)
+    device = calibration.device(profile, pages.blemishes.references)
+    graph = neutral_graph(decoder, pages.blemishes)
     mask = decoder.bundle.pilot_mask
     twin = OnnxTwin(decoder.bundle)
     likelihood = GraphLikelihood(graph)
-    if calibration.behind_late_dust:
-        late = late_dust(likelihood, twin, device, known, statistics)
-        known = without_blemishes(known, late)
-        blemishes = blemishes.joined(late)
+    blemishes, known, pair = without_late_dust(pages, likelihood, twin, device, calibration)
     measured = measured_table(
         likelihood, twin, device, known, statistics, mask, lambda share: progress("noise", 0.6 * share)
     )

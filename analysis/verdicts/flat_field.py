@@ -1,6 +1,6 @@
 """Gain of a flat field by the number of pages that it is made of, on the pages that follow them.
 
-    python -m analysis.comparison.flat_field --bundle B.zip --recording R.h5 --json F
+    python -m analysis.verdicts.flat_field --bundle B.zip --recording R.h5 --json F
 
 `B.zip` is a bundle of a calibration, and `R.h5` a recording of its device with known symbols.
 """
