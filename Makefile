@@ -79,7 +79,7 @@ PLANTED_ARGS ?=
 planted: $(STAMP)  ## plant 60 faults, one at a time, and print which of them the tests find; PLANTED_ARGS="--out FOLDER" resumes
 	$(ONE_THREAD) $(BIN)/python -m tests.planted.plant $(PLANTED_ARGS)
 
-notebooks: $(STAMP)  ## run docs/notebooks anew, and keep what they print and draw: half an hour
+notebooks: $(STAMP)  ## run docs/notebooks anew, and keep what they print and draw
 	$(BIN)/python -m tests.system.notebooks
 
 build/full-size.zip: $(STAMP)

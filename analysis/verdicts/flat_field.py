@@ -43,19 +43,18 @@ def main(bundle_path: Path, recording_path: Path, json_path: Path) -> None:
     with Recording.open(recording_path) as recording:
         device = decoder.bundle.calibration.device(decoder.bundle.profile, recording.references())
         pages = range(recording.pages)
-        errors = errors_of_pages(graph, recording, device, pages, mask)
-        found = [each for _, _, each in track(errors, "pages", total=len(pages))]
-    judges = len(found) - max(COUNTS)
+        pages_read = errors_of_pages(graph, recording, device, pages, mask)
+        by_page = [errors for _, errors in track(pages_read, "pages", total=len(pages))]
+    judges = len(by_page) - max(COUNTS)
     if judges < _LEAST_JUDGES:
-        raise RecordingError(
-            f"recording {recording_path}", f"{len(found)} pages that are read", f"{max(COUNTS) + _LEAST_JUDGES}"
-        )
-    judged = PhaseErrors.together(found[max(COUNTS) :])
+        wanted = f"at least {max(COUNTS) + _LEAST_JUDGES} of different symbols"
+        raise RecordingError(f"recording {recording_path}", f"{len(by_page)} pages that are read", wanted)
+    judged = PhaseErrors.together(by_page[max(COUNTS) :])
     rows = []
     for count in COUNTS:
         flat = np.zeros(mask.shape)
         if count:
-            made_of = PhaseErrors.together(found[:count])
+            made_of = PhaseErrors.together(by_page[:count])
             noise = made_of.noise(np.zeros_like(made_of.phases), ~mask)
             flat = flat_field(made_of.phases, np.mean(noise[0] / made_of.information + noise[1], axis=0)).phases
         bits = judged.bits(judged.noise(np.broadcast_to(flat, judged.phases.shape), ~mask), ~mask)

@@ -1,6 +1,6 @@
 """Flat field of an estimator by all known pages of its device, beside the few of its calibration.
 
-What the fitted waves miss on a device is mostly the same on every page. Two pages show some of it, sixteen nearly all.
+Part of what the fitted waves miss may be the same on every page. The more pages there are, the better it is known.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from lightpage.calibration.likelihood.interfaces import ProgressCallback
 from lightpage.calibration.likelihood.table import FLAT_FIELD
 from lightpage.calibration.sampling_table import SamplingTable
 from lightpage.errors import InvalidInputError
-from lightpage.recording.layout import narrow, page_hashes
+from lightpage.recording.layout import narrow
 from lightpage.recording.reader import Recording
 from lightpage.runtime.model.execution.estimator_graph import NOISE, EstimatorGraph
-from lightpage.runtime.recalibration.noise import UNIT_NOISE, KnownPhases, PhaseErrors, best_flat_field, placed
+from lightpage.runtime.recalibration.noise import UNIT_NOISE, KnownPhases, PhaseErrors, best_flat_field, differ, placed
 
 MOST_PAGES = 16
 """Pages, at most, from which a flat field is made."""
@@ -73,21 +73,20 @@ def flat_field_of(
     if FLAT_FIELD not in graph.ports or not others:
         return FlatFieldPages({}, ())
     earlier = np.asarray(graph.value(FLAT_FIELD), np.float64)
-    found: list[PhaseErrors] = []
+    by_page: list[PhaseErrors] = []
     hashes: list[str] = []
-    table: SamplingTable = {}
     own = 0
     pages = [*used, *others]
-    for page, known, errors in errors_of_pages(graph, recording, device, pages, mask):
+    for page, errors in errors_of_pages(graph, recording, device, pages, mask):
         progress(pages.index(page) / len(pages))
-        found.append(errors)
-        own += page in used
-        if page not in used:
-            hashes.append(min(page_hashes(known.pair)))
-        if page == others[-1] or len(hashes) == _FIRST:
-            table = _table(found, own, ~mask, earlier, graph)
-            if not table:
-                return FlatFieldPages({}, ())
+        by_page.append(errors)
+        if page in used:
+            own += 1
+            continue
+        hashes.append(recording.page_hash(page))
+        if len(hashes) == _FIRST and not _table(by_page, own, ~mask, earlier, graph):
+            return FlatFieldPages({}, ())
+    table = _table(by_page, own, ~mask, earlier, graph) if hashes else {}
     return FlatFieldPages(table, tuple(hashes) if table else ())
 
 
@@ -97,11 +96,13 @@ def errors_of_pages(
     device: CalibratedDevice,
     pages: Sequence[int],
     mask: NDArray[np.bool_],
-) -> Iterator[tuple[int, KnownPhases, PhaseErrors]]:
+) -> Iterator[tuple[int, PhaseErrors]]:
     """Yield the numbers of known pages, and their errors without a flat field, [1, ny, nx] each.
 
-    Pages without light, and pages that are not read, are left out. See `flat_field_of`.
+    Pages without light, pages that are not read, and pages with the symbols of an earlier one are left out. See
+    `flat_field_of`.
     """
+    earlier: list[NDArray[np.float64]] = []
     noise = graph.value(NOISE).copy()
     noise[-1] = UNIT_NOISE
     plain = graph.with_table({FLAT_FIELD: np.zeros(mask.shape, np.float32), NOISE: noise})
@@ -111,6 +112,9 @@ def errors_of_pages(
         except InvalidInputError:
             continue
         known = KnownPhases.of(page, device)
+        if not all(differ(known.phases, phases) for phases in earlier):
+            continue
+        earlier.append(known.phases)
         known = known._replace(pair=narrow(known.pair, recording.bit_depth))
         feeds = placed(plain, known.feeds(mask))
         state = plain.first_estimate(feeds)
@@ -118,22 +122,22 @@ def errors_of_pages(
             state = plain.step(state, feeds, step)
         errors = PhaseErrors.of([state["p"]], [known], mask)
         if abs(np.mean(np.exp(1j * errors.phases))) >= _LEAST_READ:
-            yield number, known, errors
+            yield number, errors
 
 
 def _table(
-    found: list[PhaseErrors], own: int, data: NDArray[np.bool_], earlier: NDArray[np.float64], graph: EstimatorGraph
+    by_page: list[PhaseErrors], own: int, data: NDArray[np.bool_], earlier: NDArray[np.float64], graph: EstimatorGraph
 ) -> SamplingTable:
     """Return the tensors of the best flat field; none where that of the calibration is as good.
 
     Args:
-        found: errors of pages, [1, ny, nx] each; the calibration's come first.
+        by_page: errors of pages, [1, ny, nx] each; the calibration's come first.
         own: number of the calibration's pages.
         data: symbols that are no pilots, [ny, nx].
         earlier: flat field of the calibration, radians [ny, nx].
         graph: graph of the device.
     """
-    errors = PhaseErrors.together(found)
+    errors = PhaseErrors.together(by_page)
     best = best_flat_field(errors, data, earlier, judges=slice(own, None))
     if np.array_equal(best.phases, earlier) or not best.phases.any():
         return {}

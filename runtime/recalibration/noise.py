@@ -241,7 +241,7 @@ class _KnownPages:
         self._data = ~mask
         self._earlier = earlier_flat_field
         self._takes_flat_field = FLAT_FIELD in graph.ports
-        self._distinct = all(_differ(one, other) for one, other in itertools.combinations(pages, 2))
+        self._distinct = all(differ(one.phases, other.phases) for one, other in itertools.combinations(pages, 2))
 
     def measured(self, precision: NDArray[np.float32], most: int, *, until_no_gain: bool) -> _Measured:
         """Measure noise and flat field.
@@ -333,6 +333,6 @@ def _with_noise(p: NDArray[np.float32], noise: NDArray[np.float32]) -> NDArray[n
     return np.asarray(p / (noise[0] + noise[1] * np.hypot(*p)), np.float32)
 
 
-def _differ(one: KnownPhases, other: KnownPhases) -> bool:
-    """Return whether most symbols of two pages differ. What a model lacks for one page repeats on the same page."""
-    return bool(np.mean(np.abs(wrapped(one.phases - other.phases)) > _LEAST_DIFFERENCE_RAD) > 0.5)
+def differ(one: Real, other: Real) -> bool:
+    """Return whether most phases of two pages differ. What a model lacks for one page repeats on the same page."""
+    return bool(np.mean(np.abs(wrapped(one - other)) > _LEAST_DIFFERENCE_RAD) > 0.5)

@@ -304,6 +304,14 @@ def test_a_flat_field_takes_in_further_pages_that_are_read_better_with_it(
                 symbols = usual.symbols(page)
                 assert symbols is not None
                 writer.append((symbols.astype(np.int64) - pattern) % 256, usual.frames(page))
+        again = tmp_path / "again.h5"
+        with RecordingWriter(again, PROFILE, 256, usual.bit_depth, usual.references()) as writer:
+            for _ in range(usual.pages):
+                symbols = usual.symbols(0)
+                assert symbols is not None
+                writer.append((symbols.astype(np.int64) - pattern) % 256, usual.frames(0))
+    with Recording.open(again) as repeated:  # what the model lacks for one page repeats on the same page
+        assert flat_field_of(graph, repeated, device, [0, 1], mask) == ({}, ())
     with Recording.open(path) as repeating:
         grown = flat_field_of(graph, repeating, device, [0, 1], mask)
         two_pages = flat_field_of(graph, repeating, device, [*range(6)], mask)

@@ -86,7 +86,7 @@ _ILLUMINATION_STEP = 0.02
 
 
 AFTER_REGISTRATION = 0.6
-"""Share of a calibration's time after which the likelihood of all pages is fitted: 29 of 48 s on the bench device."""
+"""Share of a calibration's time after which the likelihood of all pages is fitted, on the bench device."""
 
 
 class _Solution(NamedTuple):

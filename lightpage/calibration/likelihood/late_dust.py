@@ -48,5 +48,5 @@ def late_dust(
         lights.append(light)
     frames = zip(*((light.pair.in_phase, light.pair.quadrature) for light in lights), strict=True)
     expected = zip(*(light.expected_frames() for light in lights), strict=True)
-    passed = [passed_light(list(seen), list(clean)) for seen, clean in zip(frames, expected, strict=True)]
+    passed = [passed_light(list(counts), list(clean)) for counts, clean in zip(frames, expected, strict=True)]
     return Blemishes.behind(np.stack(passed), device.references)
